@@ -64,7 +64,7 @@ PROCESSES: tuple[Process, ...] = (
         "pliant_services.nodes.bundle_adjustment",
         finishing="adjusting the whole map",
         inputs=(topics.STREAM, topics.IMAGE, topics.EXTREMA),
-        optional=(topics.MAP_KNOWN,),
+        optional=(topics.MAP_KNOWN, topics.IMU),
         outputs=(
             topics.MAP_UPDATE,
             topics.MAP_FINAL,

@@ -6,6 +6,7 @@ The same algorithms in the same order as the services run them, so the same numb
 from dataclasses import dataclass
 
 from pliant.algorithms.image.masks import clearance_in, filled
+from pliant.algorithms.inertial.samples import ImuSamples
 from pliant.algorithms.map_delta import MapDelta
 from pliant.algorithms.slam.atlas.known_places import KnownPlaces
 from pliant.algorithms.slam.calibration_bootstrap import mapper_for
@@ -42,16 +43,18 @@ class Pipeline:
         history: MapHistory,
         timer: StageTimer = no_stages,
         places: KnownPlaces | None = None,
+        samples: ImuSamples | None = None,
     ) -> None:
         """timer: of the stages of both.    places: where the camera may be recognised, instead of a
-        mapper's own."""
+        mapper's own.   samples: inertial, of the whole source.
+        """
         self.history = history
         self._timer = timer
         self._rectifier = Rectifier(calibration)
         camera = self._rectifier.camera
         self._tracker = ExtremaTracker(camera.width, camera.height, config.tracking, config.seed)
         self._mapper = mapper_for(
-            camera, config.bundle_adjustment, config.seed, calibration.focal_sigma
+            camera, config.bundle_adjustment, config.seed, calibration.focal_sigma, samples=samples
         )
         if places is not None and isinstance(self._mapper, Mapper):
             self._mapper.atlas.places = places

@@ -81,7 +81,7 @@ def _cases(
     for name, truth in known:
         yield Case(name=name, poses=truth, truth=truth, kind="true, with noise")
     for name in runs:
-        dataset = _source(name, motions, frames)
+        dataset = source_of(name, motions, frames)
         truth_file = dataset.ground_truth_path
         assert truth_file is not None
         history = MapHistory()
@@ -91,7 +91,8 @@ def _cases(
         yield Case(name=name, poses=found, truth=read_trajectory(truth_file), kind="estimated")
 
 
-def _source(name: str, motions: Path | None, frames: int) -> Dataset:
+def source_of(name: str, motions: Path | None, frames: int) -> Dataset:
+    """A flight along one of the motions, or a built-in scene."""
     if motions is None or not (motions / f"{name}.txt").exists():
         return open_source(name if name.startswith("built-in:") else f"built-in:{name}")
     return next(flights(motions, [name], frames))

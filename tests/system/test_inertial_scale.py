@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from inertial_motion import PHONE, Motion, samples_of
 from running import NO_MESH, assert_one_line, digests, in_this_process, pliant
+from sample_files import write_imu_csv
 
 from pliant.algorithms.geometry import align_umeyama, so3_exp
 from pliant.algorithms.inertial.samples import ImuSamples
@@ -14,14 +15,10 @@ from pliant.datasets.builtin import builtin_folder
 from pliant.formats.ply import read_ply
 from pliant.formats.tum import read_tum
 from pliant.recording.map_file import MapFile
-from pliant.results.known_scale import UNSCALED
-from pliant.results.run import read_run
 
 pytestmark = pytest.mark.system
 
 SOURCE = "built-in:tabletop?width=320"
-UNITS = (("w", "rad/s"), ("a", "m/s^2"))
-COLUMNS = [(f"{name}_{axis}", unit) for name, unit in UNITS for axis in "xyz"]
 
 
 @pytest.fixture(scope="module")
@@ -34,21 +31,10 @@ def samples() -> ImuSamples:
     )  # fmt: skip
 
 
-def write_csv(path: Path, samples: ImuSamples) -> Path:
-    lines = [
-        "timestamp [ns],w_x [rad/s],w_y [rad/s],w_z [rad/s],a_x [m/s^2],a_y [m/s^2],a_z [m/s^2]"
-    ]
-    rows = np.column_stack([samples.gyro_rad_s, samples.accel_m_s2]).tolist()
-    for stamp, row in zip(samples.stamps_ns.tolist(), rows, strict=True):
-        lines.append(",".join([str(stamp), *map(repr, row)]))
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
 @pytest.fixture(scope="module")
 def metric(samples: ImuSamples, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("metric")
-    imu = write_csv(folder / "imu.csv", samples)
+    imu = write_imu_csv(folder / "imu.csv", samples)
     done = pliant("run", SOURCE, "--imu", imu, *NO_MESH, "--output", folder / "result")
     assert done.returncode == 0, done.stderr
     assert "in metres by inertial samples of 8 s" in done.stdout
@@ -64,7 +50,7 @@ def refused(samples: ImuSamples, tmp_path_factory: pytest.TempPathFactory) -> Pa
         gyro_rad_s=samples.gyro_rad_s[:, [1, 0, 2]],
         accel_m_s2=samples.accel_m_s2[:, [1, 0, 2]],
     )
-    imu = write_csv(folder / "imu.csv", mirrored)
+    imu = write_imu_csv(folder / "imu.csv", mirrored)
     done = pliant("run", SOURCE, "--imu", imu, *NO_MESH, "--output", folder / "result")
     assert done.returncode == 0, done.stderr
     assert "inertial samples not used: the axes of the gyro are left-handed" in done.stdout
@@ -95,17 +81,15 @@ def test_the_result_is_in_metres_and_level(metric: Path) -> None:
     assert "in metres: scale +- " in (metric / "calibration.yaml").read_text()
 
 
-def test_a_refusal_leaves_the_result_as_it_is(metric: Path, refused: Path) -> None:
+def test_a_refusal_leaves_the_result_as_it_is(refused: Path, tmp_path: Path) -> None:
     report = json.loads((refused / "report.json").read_text())
     assert not report["scale_is_metric"]
     assert report["scale"] is None
     assert report["inertial_refusal"].startswith("the axes of the gyro are left-handed")
     assert not (refused / "scale.yaml").exists()
-    before = read_run(metric / "recording.mcap", UNSCALED).history
-    after = read_run(refused / "recording.mcap").history
-    assert before.final().keys() == after.final().keys()
-    for (_, a), (_, b) in zip(before.final().values(), after.final().values(), strict=True):
-        assert a.tobytes() == b.tobytes()
+    done = pliant("run", SOURCE, *NO_MESH, "--output", tmp_path / "without")
+    assert done.returncode == 0, done.stderr
+    assert digests(refused) == digests(tmp_path / "without")
 
 
 def test_samples_of_a_file_come_later(refused: Path, metric: Path) -> None:
@@ -116,4 +100,5 @@ def test_samples_of_a_file_come_later(refused: Path, metric: Path) -> None:
     done = in_this_process("scale", refused, "--imu", metric.parent / "imu.csv")
     assert done.returncode == 0, done.stderr
     assert "and z is up" in done.stdout
-    assert digests(refused) == digests(metric)
+    after, during = (read_tum(folder / "trajectory.txt") for folder in (refused, metric))
+    np.testing.assert_allclose(after.T_world_camera, during.T_world_camera, atol=2e-3)

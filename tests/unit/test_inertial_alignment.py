@@ -18,7 +18,7 @@ from pliant.algorithms.inertial.preintegration import (
     preintegrate,
 )
 from pliant.algorithms.inertial.residuals import COMMON, OWN, State, linearised
-from pliant.algorithms.inertial.rotation_alignment import align_rotation
+from pliant.algorithms.inertial.rotation_alignment import align_rotation, turns_of
 from pliant.algorithms.inertial.samples import ImuSamples
 
 R_CAMERA_IMU = so3_exp(np.array([0.3, 2.0, 1.0]))
@@ -130,7 +130,7 @@ def test_any_axis_order_and_offset(walk: Motion) -> None:
             gyro=samples.gyro_rad_s @ order,
             accel=samples.accel_m_s2 @ order,
         )
-        found = align_rotation(times_s, poses[:, :3, :3], signal, 0.04)
+        found = align_rotation(times_s, turns_of(poses[:, :3, :3]), signal, 0.04)
         assert found is not None
         assert angle_deg(found.R_camera_imu.T @ R_CAMERA_IMU @ order) < 0.5
         assert found.offset_s == pytest.approx(0.4 + shift_s, abs=0.003)

@@ -7,7 +7,7 @@ import pytest
 from bundle_scene import make_scene, move
 from mapping_scene import CAMERA, looking
 
-from pliant.algorithms.geometry import inverse, so3_log, transform
+from pliant.algorithms.geometry import inverse, so3_exp, so3_log, transform
 from pliant.algorithms.slam.estimate.dense_layout import BLOCK, Table
 from pliant.algorithms.slam.estimate.pose import Correspondences, Spread, refine_pose
 from pliant.algorithms.slam.estimate.pose_prior import PosePrior, add_prior
@@ -138,6 +138,17 @@ def test_a_prior_of_the_rotation_leaves_the_centre_to_the_points():
     prior = PosePrior(MEAN, information)
     T, *_ = refine_pose(TRUE, seen._replace(points_px=px, prior=prior), CAMERA, PARAMETERS)
     np.testing.assert_allclose(T, turned, atol=1e-4)
+
+
+def test_a_prior_is_left_out_of_a_pose_that_contradicts_it():
+    information = np.diag([0.0] * 3 + [1e4] * 3)  # 10 mrad
+    prior = PosePrior(MEAN, information)
+    near, far = MEAN.copy(), MEAN.copy()
+    near[:3, :3] = MEAN[:3, :3] @ so3_exp(np.array([0.03, 0.0, 0.0]))
+    far[:3, :3] = MEAN[:3, :3] @ so3_exp(np.array([0.0, 0.05, 0.0]))
+    near[:3, 3] += 10.0  # of which it says nothing
+    assert prior.unless_contradicted(near) is prior
+    assert not prior.unless_contradicted(far).information.any()
 
 
 def test_a_fixed_centre_stays_exactly_and_the_rotation_follows_its_prior():

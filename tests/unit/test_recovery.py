@@ -10,7 +10,8 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 from pictured_scene import _SIDE, dark, picture, textures
 
 from pliant.algorithms.arrays import U8
-from pliant.algorithms.geometry import inverse
+from pliant.algorithms.geometry import inverse, so3_exp
+from pliant.algorithms.inertial.gyro import GyroTurn
 from pliant.algorithms.map_delta import LOST, TRACKING
 from pliant.algorithms.slam.frame import Frame
 from pliant.algorithms.slam.locate.landmark_search import search_radius_px
@@ -146,3 +147,18 @@ def test_the_search_grows_with_the_time_without_a_pose_and_has_an_end():
     radii = [search_radius_px(s, CAMERA, parameters) for s in (0.03, 0.3, 100.0)]
     assert 0.0 < radii[0] < radii[1] < radii[2]
     assert radii[2] == parameters.max_radius_share * CAMERA.width
+
+
+def test_predictions_and_their_prior_have_the_rotation_of_the_gyro():
+    first, second = looking((0.0, 0.0, 0.0)), looking((0.1, 0.0, 0.0), (0.0, 0.05, 0.0))
+    turn = GyroTurn(R=so3_exp(np.array([0.3, 0.0, 0.0])), covariance=1e-6 * np.eye(3))
+    motion = Motion(frames=(0, 1), stamps_ns=(0, INTERVAL_NS), poses=(first, second), turn=turn)
+    going, standing = motion.predictions(2 * INTERVAL_NS)
+    for each in (going, standing):
+        np.testing.assert_allclose(each[:3, :3], second[:3, :3] @ turn.R, atol=1e-12)
+    assert np.linalg.norm(going[:3, 3] - second[:3, 3]) == pytest.approx(0.1)
+    np.testing.assert_array_equal(standing[:3, 3], second[:3, 3])
+    prior = motion.prior(CAMERA)
+    assert prior.unless_contradicted(standing) is prior
+    assert prior.unless_contradicted(second) is not prior
+    assert not motion.then(2, 2 * INTERVAL_NS, going).prior(CAMERA).information.any()

@@ -2,6 +2,7 @@
 
 in   camera/stream    once
      map/known        before the first frame: a map of earlier sessions, to continue in
+     imu/samples      the inertial samples of the source, if they come before the first frame
      camera/image     every frame: colours, and for re-acquisition patches and maxima of curvature;
                       in live mode, whether to map the frame, or only to localise it by its tracks
      tracks/extrema   every frame
@@ -16,6 +17,7 @@ out  map/update       one per frame: pose, points, keyframes, corrections of ear
 Global bundle adjustment runs in a thread, in parallel with tracking, see ``global_adjustment.py``.
 """
 
+from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeAlias
 
@@ -62,6 +64,7 @@ from pliant.messages.types import (
     MapKeyframe,
     MapUpdate,
 )
+from pliant.recording.measured import imu_in
 from pliant_services.runtime.link_images import clearance, receive_images, whole
 from pliant_services.runtime.monitor import Monitor
 
@@ -75,16 +78,21 @@ _JPEG_QUALITY = 95
 def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     """Map until the tracks end."""
 
-    def start() -> tuple[Header, FrameMapper, dict[int, _Kept]]:
+    def start() -> tuple[Header, FrameMapper, dict[int, _Kept], bool]:
         stream = receive_one(bus, topics.STREAM, CameraStream)
         known: list[MapKeyframe] = []
         if bus.reads(topics.MAP_KNOWN):
             known += receive(bus, topics.MAP_KNOWN, MapKeyframe)
+        # A recording of an earlier release has no topic of samples.
+        told, later = bus.reads(topics.IMU), stream.sensors_last
+        samples = imu_in(bus.receive(topics.IMU)) if told and not later else None
         parameters, sigma = config.bundle_adjustment, stream.focal_sigma
-        return stream, mapper_for(stream.camera, parameters, config.seed, sigma, known), {}
+        mapper = mapper_for(stream.camera, parameters, config.seed, sigma, known, samples)
+        return stream, mapper, {}, told and later
 
     # waiting: images and masks of the frames from which a map may yet start, by frame number.
-    last, mapper, waiting = resume(bus, start)
+    # later: samples come after the last frame, too late for any.
+    last, mapper, waiting, later = resume(bus, start)
     extrema = receive(bus, topics.EXTREMA, Extrema)
     worker = AdjustmentWorker()
     for image, tracks in join(receive_images(bus, mapped_only=True), extrema):
@@ -123,7 +131,9 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
         )
         last = Header(frame=tracks.frame, stamp_ns=tracks.stamp_ns, frame_id=tracks.frame_id)
         worker.start(mapper.global_adjustment)
-        bus.checkpoint(tracks.frame, (last, mapper, waiting))
+        bus.checkpoint(tracks.frame, (last, mapper, waiting, later))
+    if later:
+        deque(bus.receive(topics.IMU), maxlen=0)
     with monitor.stage("finish"):
         final = mapper.finish()
     bus.publish(topics.MAP_FINAL, _update(last, final))

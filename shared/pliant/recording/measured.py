@@ -1,6 +1,6 @@
 """Inertial samples and satellite fixes as messages, and back from a recording."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import fields
 from typing import Any
 
@@ -8,7 +8,6 @@ import numpy as np
 
 from pliant.algorithms.inertial.samples import GpsFixes, ImuSamples
 from pliant.messages import topics
-from pliant.messages.topics import Topic
 from pliant.messages.types import GPS_FRAME_ID, IMU_FRAME_ID, GpsPiece, Header, ImuPiece
 from pliant.recording.reader import Recording
 
@@ -49,7 +48,12 @@ def imu_of(recording: Recording) -> ImuSamples:
 
     Raises MessageError.
     """
-    return ImuSamples(**_joined(recording, topics.IMU, ImuSamples.empty()))
+    return imu_in(recording.decoded(topics.IMU))
+
+
+def imu_in(pieces: Iterable[Header]) -> ImuSamples:
+    """The samples of ``imu_pieces``."""
+    return ImuSamples(**_joined(pieces, ImuSamples.empty()))
 
 
 def fixes_of(recording: Recording) -> GpsFixes:
@@ -57,7 +61,7 @@ def fixes_of(recording: Recording) -> GpsFixes:
 
     Raises MessageError.
     """
-    return GpsFixes(**_joined(recording, topics.GPS, GpsFixes.empty()))
+    return GpsFixes(**_joined(recording.decoded(topics.GPS), GpsFixes.empty()))
 
 
 def _parts(count: int) -> Iterator[tuple[int, slice]]:
@@ -65,12 +69,10 @@ def _parts(count: int) -> Iterator[tuple[int, slice]]:
         yield number, slice(start, min(count, start + _PIECE))
 
 
-def _joined(recording: Recording, topic: Topic, empty: ImuSamples | GpsFixes) -> dict[str, Any]:
-    """Every array of the pieces of a topic, end to end."""
-    pieces: list[Header] = list(recording.decoded(topic))
+def _joined(pieces: Iterable[Header], empty: ImuSamples | GpsFixes) -> dict[str, Any]:
+    """Every array of pieces, end to end."""
+    each = [empty, *pieces]
     return {
-        field.name: np.concatenate(
-            [getattr(empty, field.name), *(getattr(piece, field.name) for piece in pieces)]
-        )
+        field.name: np.concatenate([getattr(piece, field.name) for piece in each])
         for field in fields(empty)
     }

@@ -142,11 +142,20 @@ def inertial(
     ] = None,
     frames: Annotated[int, typer.Option(min=100, help="First frames of motions to run.")] = 600,
     seeds: Annotated[int, typer.Option(min=1, help="Sensors and noises of each motion.")] = 4,
+    gyro: Annotated[
+        str | None,
+        typer.Option(help="Instead, the poses of --run with a gyro and without: dark or seen."),
+    ] = None,
 ) -> None:
     """Scale, vertical, offset and rotation from inertial samples, and what wrong ones come to.
 
     scripts/bench inertial euroc_gt_leftcam --run tabletop --run V102
+    scripts/bench inertial --run room --gyro dark
     """
+    from benchmarks.dark_turns import measure as with_gyro
     from benchmarks.inertial import measure
 
+    if gyro is not None:
+        show(with_gyro(motions, runs or [], frames, seeds, is_dark=gyro == "dark"))
+        return
     show(measure(motions, only=only or [], runs=runs or [], frames=frames, seeds=seeds))

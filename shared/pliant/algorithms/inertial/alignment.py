@@ -9,7 +9,12 @@ from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.inertial.estimator import NOISE_RANGE, Estimate, estimate
 from pliant.algorithms.inertial.preintegration import ImuSignal, NoiseDensity
 from pliant.algorithms.inertial.residuals import GRAVITY, GRAVITY_M_S2, OFFSET, TURN, Nodes, State
-from pliant.algorithms.inertial.rotation_alignment import RotationAlignment, align_rotation
+from pliant.algorithms.inertial.rotation_alignment import (
+    RotationAlignment,
+    align_rotation,
+    longest_gap_s,
+    turns_of,
+)
 from pliant.algorithms.inertial.samples import ImuSamples
 
 _NODE_S = 0.2
@@ -24,8 +29,6 @@ _STRETCH = 50
 """Nodes that stay together where there are more."""
 _RATE_HZ = 250.0
 """Samples of twice this rate and more are averaged: a camera that is carried moves slower."""
-_LONGEST_GAP = 4.0
-"""Between two samples, in usual intervals."""
 _AROUND_S = 0.05
 """By how much the offset may change after it was found by rotations."""
 _LEAST_DENSITY = NoiseDensity(gyro=1e-4, accel=1e-3)
@@ -89,10 +92,10 @@ def align_inertial(
             f"at least {_LEAST} of both are needed"
         )
     times_s = (stamps_ns - stamps_ns[0]) * 1e-9
-    signal = _signal(samples, int(stamps_ns[0]))
-    gap_s = _LONGEST_GAP * float(np.median(np.diff(signal.times_s)))
-    rotation = align_rotation(times_s, T_world_camera[:, :3, :3], signal, gap_s)
-    why = _rotation_fault(rotation)
+    signal = averaged_signal(samples, int(stamps_ns[0]))
+    gap_s = longest_gap_s(signal)
+    rotation = align_rotation(times_s, turns_of(T_world_camera[:, :3, :3]), signal, gap_s)
+    why = rotation_fault(rotation)
     if why or rotation is None:
         return Refusal(why)
     centred = T_world_camera[:, :3, 3] - T_world_camera[:, :3, 3].mean(axis=0)
@@ -118,7 +121,7 @@ def align_inertial(
     return _judged(found, nodes, rotation, extent)
 
 
-def _signal(samples: ImuSamples, origin_ns: int) -> ImuSignal:
+def averaged_signal(samples: ImuSamples, origin_ns: int) -> ImuSignal:
     """In seconds of the camera's first stamp, averaged where there are too many samples."""
     times_s = np.float64(1e-9) * (samples.stamps_ns - origin_ns)
     together = int(max(1.0 / (_RATE_HZ * float(np.median(np.diff(times_s)))), 1.0))
@@ -153,7 +156,8 @@ def noise_densities(signal: ImuSignal) -> NoiseDensity:
     )
 
 
-def _rotation_fault(rotation: RotationAlignment | None) -> str:
+def rotation_fault(rotation: RotationAlignment | None) -> str:
+    """Why the gyro does not fit the camera; "" if it does."""
     if rotation is None:
         return "poses and inertial samples without gaps do not overlap in time"
     fits = rotation.correlation**2

@@ -17,7 +17,7 @@ C is computed for all offsets at once by the fast Fourier transform, so neither 
 axes nor the offset needs a start value.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +27,13 @@ from pliant.algorithms.geometry import so3_exp, so3_log
 from pliant.algorithms.inertial.preintegration import ImuSignal
 
 _STEP_S = 0.02
-_AVERAGED_S = 0.2
+AVERAGED_S = 0.2
 """Below it hands and drones hardly turn differently, and the noise of single poses is large."""
 _LONGEST_STEP_S = 0.25
 """Between two poses: what happens in a longer one is not known."""
 _FINE_S = 0.001
+_LONGEST_GAP = 4.0
+"""Between two samples, in usual intervals."""
 _LEAST_OVERLAP_S = 3.0
 _TINY = 1e-12
 _ONE_AXIS = 0.05
@@ -63,68 +65,86 @@ class RotationAlignment:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Rates:
+class Rates:
     """Averages (N, 3) on a grid of time; weight (N,) is 0 where they are unknown."""
 
     first_s: float
     rates: F64
     weights: F64
 
+    @property
+    def independent(self) -> "Rates":
+        """Those whose intervals do not overlap."""
+        apart = round(AVERAGED_S / _STEP_S)
+        return replace(self, rates=self.rates[::apart], weights=self.weights[::apart])
+
 
 def align_rotation(
-    times_s: F64, R_world_camera: F64, signal: ImuSignal, longest_gap_s: float
+    times_s: F64, turns: F64, signal: ImuSignal, gap_s: float
 ) -> RotationAlignment | None:
-    """From poses (N,), (N, 3, 3).  None if no offset leaves enough overlap."""
-    camera = _camera_rates(times_s, R_world_camera)
-    gyro = _gyro_rates(signal, longest_gap_s, float(signal.times_s[0]))
+    """From poses at times (N,), and the turns (N - 1, 3) from each to the next.  None if no offset
+    leaves enough overlap."""
+    camera = camera_rates(times_s, turns)
+    gyro = gyro_rates(signal, gap_s, float(signal.times_s[0]))
     coarse = _coarse_offset(camera, gyro)
     if coarse is None:
         return None
     best: RotationAlignment | None = None
     for offset in coarse + np.arange(-2.0 * _STEP_S, 2.0 * _STEP_S, _FINE_S):
-        found = _wahba(camera, _gyro_rates(signal, longest_gap_s, camera.first_s + offset), offset)
+        found = _wahba(camera, gyro_rates(signal, gap_s, camera.first_s + offset), offset)
         if found is not None and (best is None or found.correlation > best.correlation):
             best = found
     return best
 
 
-def _averaged(times_s: F64, angles: F64, known: BoolArray, first_s: float) -> _Rates:
+def _averaged(times_s: F64, angles: F64, known: BoolArray, first_s: float) -> Rates:
     """times_s: (N,).  angles: (N, 3) integrals of the angular velocity.  known: (N - 1,) whether
     each step between two times is known."""
-    count = int((times_s[-1] - first_s - _AVERAGED_S) / _STEP_S) + 1
+    count = int((times_s[-1] - first_s - AVERAGED_S) / _STEP_S) + 1
     starts = first_s + _STEP_S * np.arange(max(count, 0))
-    ends = starts + _AVERAGED_S
+    ends = starts + AVERAGED_S
     unknown_s = np.concatenate([[0.0], np.cumsum(np.where(known, 0.0, np.diff(times_s)))])
 
     def between(values: F64) -> F64:
         return np.interp(ends, times_s, values) - np.interp(starts, times_s, values)
 
-    rates = np.column_stack([between(column) for column in angles.T]) / _AVERAGED_S
+    rates = np.column_stack([between(column) for column in angles.T]) / AVERAGED_S
     inside = (starts >= times_s[0]) & (between(unknown_s) < 1e-9)
-    return _Rates(first_s=first_s, rates=rates * inside[:, None], weights=inside.astype(np.float64))
+    return Rates(first_s=first_s, rates=rates * inside[:, None], weights=inside.astype(np.float64))
 
 
-def _camera_rates(times_s: F64, R_world_camera: F64) -> _Rates:
-    turns = so3_log(R_world_camera[:-1].swapaxes(1, 2) @ R_world_camera[1:])
+def turns_of(R_world_camera: F64) -> F64:
+    """(N - 1, 3) rotation vectors from each of the rotations (N, 3, 3) to the next."""
+    return so3_log(R_world_camera[:-1].swapaxes(1, 2) @ R_world_camera[1:])
+
+
+def longest_gap_s(signal: ImuSignal) -> float:
+    """Between two samples, beyond which some are missing."""
+    return _LONGEST_GAP * float(np.median(np.diff(signal.times_s)))
+
+
+def camera_rates(times_s: F64, turns: F64) -> Rates:
+    """Of the camera.  turns: as of ``align_rotation``."""
     angles = np.concatenate([np.zeros((1, 3)), np.cumsum(turns, axis=0)])
     return _averaged(times_s, angles, np.diff(times_s) <= _LONGEST_STEP_S, float(times_s[0]))
 
 
-def _gyro_rates(signal: ImuSignal, longest_gap_s: float, first_s: float) -> _Rates:
+def gyro_rates(signal: ImuSignal, gap_s: float, first_s: float) -> Rates:
+    """Of the gyro, from a time of its clock on."""
     steps = np.diff(signal.times_s)
     turns = 0.5 * (signal.gyro[1:] + signal.gyro[:-1]) * steps[:, None]
     angles = np.concatenate([np.zeros((1, 3)), np.cumsum(turns, axis=0)])
-    return _averaged(signal.times_s, angles, steps <= longest_gap_s, float(first_s))
+    return _averaged(signal.times_s, angles, steps <= gap_s, float(first_s))
 
 
-def _coarse_offset(camera: _Rates, gyro: _Rates) -> float | None:
+def _coarse_offset(camera: Rates, gyro: Rates) -> float | None:
     """The offset on the grid with the largest correlation, over all offsets."""
     length = len(camera.rates) + len(gyro.rates)
     if not len(camera.rates) or not len(gyro.rates):
         return None
     size = 1 << int(np.ceil(np.log2(length)))
 
-    def spectrum(rates: _Rates) -> NDArray[np.complex128]:
+    def spectrum(rates: Rates) -> NDArray[np.complex128]:
         squares = (rates.rates**2).sum(axis=1)
         columns = np.column_stack([rates.weights, rates.rates, squares])
         return np.fft.rfft(columns, size, axis=0)
@@ -150,7 +170,7 @@ def _coarse_offset(camera: _Rates, gyro: _Rates) -> float | None:
     return shift * _STEP_S + gyro.first_s - camera.first_s
 
 
-def _wahba(camera: _Rates, gyro: _Rates, offset_s: float) -> RotationAlignment | None:
+def _wahba(camera: Rates, gyro: Rates, offset_s: float) -> RotationAlignment | None:
     """The least squares rotation of two signals on the same grid."""
     both = min(len(camera.rates), len(gyro.rates))
     rows = np.flatnonzero(camera.weights[:both] * gyro.weights[:both])

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.inertial.samples import ImuSamples
 from pliant.algorithms.map_delta import TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment
 from pliant.algorithms.slam.calibration.self_calibration import is_guess, widened
@@ -55,10 +56,11 @@ class BootstrapMapper:
         parameters: MappingParameters,
         seed: int,
         known: Sequence[KeptKeyframe] = (),
+        samples: ImuSamples | None = None,
     ) -> None:
-        """known: as of ``Mapper``; the trial ignores it."""
+        """known, samples: as of ``Mapper``; the trial ignores them."""
         self._anew = (camera, parameters, seed)
-        self._known = list(known)
+        self._known, self._samples = list(known), samples
         self._mapper = Mapper(camera, parameters, seed)
         self._taken: list[_Taken] = []
         self._on_trial = True
@@ -137,7 +139,10 @@ class BootstrapMapper:
 
     def _map_all_taken(self, timer: StageTimer) -> Outcome:
         """Map all waiting frames with the estimated camera.  Returns the newest outcome."""
-        self._mapper = Mapper(*self._anew, calibration=self._mapper.calibration, known=self._known)
+        self._mapper = Mapper(
+            *self._anew, self._mapper.calibration, known=self._known, samples=self._samples
+        )
+        self._samples = None
         self._on_trial = False
         taken, self._taken = self._taken, []
         return [self._again(each, timer) for each in taken][-1]
@@ -157,18 +162,20 @@ def mapper_for(
     seed: int,
     focal_sigma: float = 0.0,
     known: Sequence[KeptKeyframe] = (),
+    samples: ImuSamples | None = None,
 ) -> FrameMapper:
     """Return the mapper for a camera, depending on how certain its calibration is: see ``widened``.
 
     known: a loaded map; if it is of the same camera, its calibration is used.
+    samples: inertial, of the whole source.
     """
     parameters = widened(parameters, focal_sigma)
     if parameters.only_localise:
         return Localiser(camera, parameters, seed, known=known)
     found = known_camera(known, camera)
     if is_guess(parameters.calibration) and (found is None or found.sigmas[0] > _KNOWN):
-        return BootstrapMapper(camera, parameters, seed, known)
-    return Mapper(camera, parameters, seed, known=known)
+        return BootstrapMapper(camera, parameters, seed, known, samples)
+    return Mapper(camera, parameters, seed, known=known, samples=samples)
 
 
 def _nothing(reason: str) -> MapDelta:

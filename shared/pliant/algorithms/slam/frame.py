@@ -9,6 +9,7 @@ from pliant.algorithms.arrays import F32, F64, U8
 from pliant.algorithms.image.moved_image import MovedImage
 from pliant.algorithms.slam.calibration.rolling_shutter import RolledFrame
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.estimate.pose_prior import NO_PRIOR, PosePrior
 from pliant.algorithms.slam.locate.pose_quality import Support
 from pliant.algorithms.slam.map.keyframe import Observations
 from pliant.algorithms.tracks import FrameExtrema, FrameTracks
@@ -100,7 +101,7 @@ class PlacedFrame:
     """A frame with its pose in the map.
 
     found: visible landmarks without a track.   support: of the pose, after its adjustment.
-    is_pure_rotation: since the last keyframe.
+    is_pure_rotation: since the last keyframe.   prior: of the pose.
     """
 
     frame: IdealFrame
@@ -108,3 +109,4 @@ class PlacedFrame:
     found: Observations = field(default_factory=Observations.none)
     support: Support = field(default_factory=Support)
     is_pure_rotation: bool = False
+    prior: PosePrior = NO_PRIOR

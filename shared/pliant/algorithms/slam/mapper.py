@@ -13,6 +13,8 @@ import numpy as np
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.image.exposure import flaw_of
+from pliant.algorithms.inertial.gyro import Gyro
+from pliant.algorithms.inertial.samples import ImuSamples
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.slam.active.active_map import ActiveMap
 from pliant.algorithms.slam.active.frame_pose import (
@@ -25,6 +27,7 @@ from pliant.algorithms.slam.active.frame_pose import (
     tracks_to_points,
 )
 from pliant.algorithms.slam.active.tracked_pose import pose_by_tracks
+from pliant.algorithms.slam.adjust.carried_frames import carried_poses
 from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment
 from pliant.algorithms.slam.adjust.ordinary_frames import (
     STANDING_ROOMS,
@@ -75,9 +78,10 @@ class Mapper:
         seed: int,
         calibration: SelfCalibration | None = None,
         known: Sequence[KeptKeyframe] = (),
+        samples: ImuSamples | None = None,
     ) -> None:
         """calibration: estimated so far; None: that of the map, or of the parameters.   known: a
-        loaded map in which the camera may be recognised.
+        loaded map in which the camera may be recognised.   samples: inertial, of the whole source.
         """
         calibration = (
             calibration
@@ -92,6 +96,8 @@ class Mapper:
         self._waiting = InitialisationBuffer()
         self._stamps_ns: dict[int, int] = {}  # capture time of each frame
         self._motion = Motion.at(0, 0, np.eye(4))  # in the active segment
+        self._gyro = None if samples is None else Gyro.of(samples)
+        self._without_pose: list[int] = []
         self._lost_frames = 0
         self._keyframe_ns = 0
         self._keyframe_is_new = False
@@ -122,7 +128,8 @@ class Mapper:
     @property
     def counters(self) -> dict[str, int]:
         """Results of place comparisons, and numbers of dropped keyframes and landmarks."""
-        return self.atlas.places.comparisons.counters | self.atlas.dropped
+        turned = {} if self._gyro is None else self._gyro.counters
+        return self.atlas.places.comparisons.counters | self.atlas.dropped | turned
 
     def kept(self) -> Iterator[KeptKeyframe]:
         """As of the atlas."""
@@ -143,7 +150,7 @@ class Mapper:
             return self._lost(active, ideal)
         with timer("reacquisition"):
             ideal = to_global_shutter(active, self._motion, ideal, located)
-            placed = reacquire_points(active, ideal, located)
+            placed = reacquire_points(active, ideal, located, self._motion.prior(self._camera))
         with timer("subspace adjustment"):
             placed = adjust(active, self._motion, placed)
         with timer("triangulation"):
@@ -176,8 +183,15 @@ class Mapper:
                     self._waiting = self._waiting.seen_by(before.view, self.calibration.view)
             atlas.active.links.follow(frame.extrema.ids, atlas.points)
             atlas.focus(self._motion, frame.stamp_ns, frame.extrema)
+            self._turn_to(frame.stamp_ns)
         with timer("corrected view"):
             return IdealFrame.of(frame, self.calibration)
+
+    def _turn_to(self, stamp_ns: int) -> None:
+        """Ask the gyro how the camera has turned since its last pose."""
+        if self._gyro is not None:
+            turn = self._gyro.turn(self._motion.stamps_ns[1], stamp_ns)
+            self._motion = replace(self._motion, turn=turn)
 
     def _keyframe_is_due(self, active: ActiveMap, stamp_ns: int) -> bool:
         if active.segment.resumes:
@@ -214,6 +228,10 @@ class Mapper:
         self._place_waiting(active, keyframe, T_world_camera)
         self._waiting = InitialisationBuffer()
         to_points = tracks_to_points(active, placed)
+        before_ns, before = self._motion.stamps_ns[1], self._motion.poses[1]
+        if self._gyro is not None and before_ns < placed.frame.stamp_ns:
+            turn = before[:3, :3].T @ T_world_camera[:3, :3]
+            self._gyro.see(before_ns, placed.frame.stamp_ns, turn)
         self._motion = then(
             number, placed.frame.stamp_ns, T_world_camera, support.tracked, to_points
         )
@@ -261,6 +279,7 @@ class Mapper:
         if active is not None and not self._lost_frames:
             active.links.follow(frame.extrema.ids, active.points)
             self.atlas.focus(self._motion, frame.stamp_ns, frame.extrema)
+            self._turn_to(frame.stamp_ns)
             found = pose_by_tracks(active, self.calibration, self._motion, frame, self._generator)
         if active is None or found is None:
             ideal = IdealFrame.of(frame, self.calibration)
@@ -302,6 +321,8 @@ class Mapper:
             segment.keyframes, segment.path, self._stamps_ns, segment.points, seen_by,
             self._parameters,
         )  # fmt: skip
+        if self._gyro is not None:
+            smoothed += carried_poses(smoothed, self._stamps_ns, self._without_pose, self._gyro)
         for each in smoothed:
             self.journal.add_pose(each.frame, each.keyframe, each.T_world_camera, each.inliers)
 
@@ -429,6 +450,7 @@ class Mapper:
         seen = len(active.linked(MAPPED))
         reason = f"lost: the pose of frame {frame.number} is not supported, {seen} mapped tracks"
         self._lost_frames += 1
+        self._without_pose.append(frame.number)
         self._waiting = self._waiting.then(frame, self._parameters)
         outcome = self._outcome(LOST, self._flaw(frame) or reason, 0)
         long = self._motion.lost_s(frame.stamp_ns) > self._parameters.localisation.max_lost_s

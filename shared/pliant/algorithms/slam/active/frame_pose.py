@@ -13,6 +13,7 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.slam.active.active_map import ActiveMap
 from pliant.algorithms.slam.estimate.observation_table import reprojection_errors
 from pliant.algorithms.slam.estimate.pose import Correspondences
+from pliant.algorithms.slam.estimate.pose_prior import NO_PRIOR, PosePrior
 from pliant.algorithms.slam.frame import IdealFrame, PlacedFrame
 from pliant.algorithms.slam.locate.inverse_depth import (
     off_epipolar_line,
@@ -83,7 +84,8 @@ def localise(
             rolled = active.segment.rolled(frame.calibration, motion.velocity)
             depths = active.segment.inverse_depths(rows, predictions[0])
             points_px = rolled.removed(points_px, depths)
-        located = _by_tracks(active, predictions, rows, points_px, candidates, generator)
+        prior = motion.prior(active.camera)
+        located = _by_tracks(active, predictions, prior, rows, points_px, candidates, generator)
         inliers = int(located.inliers.sum())
         of_points = int(located.inliers[: len(linked) - len(candidates)].sum())
         if of_points + _OF_CANDIDATE * (inliers - of_points) >= limits.min_inliers:
@@ -107,6 +109,7 @@ def localise(
 def _by_tracks(
     active: ActiveMap,
     predictions: list[F64],
+    prior: PosePrior,
     rows: I32,
     points_px: F32,
     candidates: I64,
@@ -118,10 +121,10 @@ def _by_tracks(
     def located(seen: Correspondences) -> Localisation:
         return locate(predictions, seen, active.camera, limits, generator)
 
-    together = located(_correspondences(active, rows, points_px, len(candidates)))
+    together = located(_correspondences(active, prior, rows, points_px, len(candidates)))
     still = together.inliers[:mapped].sum()
     if len(candidates) and mapped >= limits.min_inliers and still < _AGREEING * mapped:
-        alone = located(_correspondences(active, rows[:mapped], points_px[:mapped], 0))
+        alone = located(_correspondences(active, prior, rows[:mapped], points_px[:mapped], 0))
         fitting = alone.inliers.sum()
         if fitting >= limits.min_inliers and still < _AGREEING * fitting:
             active.candidates_agree = False
@@ -141,9 +144,12 @@ def to_global_shutter(
     return frame.to_global_shutter(rolled, depths)
 
 
-def reacquire_points(active: ActiveMap, frame: IdealFrame, T_world_camera: F64) -> PlacedFrame:
+def reacquire_points(
+    active: ActiveMap, frame: IdealFrame, T_world_camera: F64, prior: PosePrior = NO_PRIOR
+) -> PlacedFrame:
     """Find landmarks without a track among the maxima, and refine the pose with them."""
-    placed = PlacedFrame(frame=frame, T_world_camera=T_world_camera)
+    prior = prior.unless_contradicted(T_world_camera)
+    placed = PlacedFrame(frame=frame, T_world_camera=T_world_camera, prior=prior)
     points, parameters, tracks = active.points, active.parameters, frame.tracks
     if not parameters.reacquisition.enabled:
         return placed
@@ -166,7 +172,7 @@ def refine_by_all(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
     """Refine the pose by its tracks and the landmarks found without one."""
     candidates = active.helping_candidates()
     rows, points_px = active.observed(placed, candidates)
-    seen = _correspondences(active, rows, points_px, len(candidates))
+    seen = _correspondences(active, placed.prior, rows, points_px, len(candidates))
     limits = active.parameters.localisation
     located = refine(placed.T_world_camera, seen, active.camera, limits, near=True)
     return replace(placed, T_world_camera=located.T_world_camera)
@@ -177,7 +183,8 @@ def adjust(active: ActiveMap, motion: Motion, placed: PlacedFrame) -> PlacedFram
     judge_tracks(active, placed)
     active.see(placed)
     if active.parameters.window.sweeps > 0 and not len(active.helping_candidates()):
-        placed = replace(placed, T_world_camera=active.window.sweep_current(active.parameters))
+        swept = active.window.sweep_current(active.parameters, placed.prior)
+        placed = replace(placed, T_world_camera=swept)
     return supported(active, motion, placed)
 
 
@@ -245,7 +252,7 @@ def check_pure_rotation(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
     T_standing = placed.T_world_camera
     for every in (max(1, len(rows) // _DECIDING), 1):  # a few tracks reveal most motions
         some = np.arange(0, len(rows), every)
-        seen = _correspondences(active, rows[some], points_px[some], len(rows))
+        seen = _correspondences(active, placed.prior, rows[some], points_px[some], len(rows))
         located = refine(
             placed.T_world_camera, seen, active.camera, parameters.localisation, near=True
         )
@@ -256,11 +263,11 @@ def check_pure_rotation(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
 
 
 def _correspondences(
-    active: ActiveMap, rows: I32, points_px: F32, candidates: int
+    active: ActiveMap, prior: PosePrior, rows: I32, points_px: F32, candidates: int
 ) -> Correspondences:
     """Rows (N,) at points_px (N, 2).   candidates: how many of the rows are provisional."""
     spread = spread_of(active.points, rows, active.keyframes[-1]) if candidates else None
-    return Correspondences(active.points.xyz[rows], points_px, spread=spread)
+    return Correspondences(active.points.xyz[rows], points_px, spread=spread, prior=prior)
 
 
 def limits_of_points(inliers: int, parameters: MappingParameters) -> PointParameters:

@@ -15,6 +15,9 @@ import numpy as np
 from pliant.algorithms.arrays import F64
 from pliant.compiler.kernel import kernel
 
+_CONTRADICTION = 4.0
+"""Standard deviations: 1 of 1000 poses is farther away by chance."""
+
 
 class PosePrior(NamedTuple):
     """A Gaussian prior of a pose, in units of observations with an error of 1 px.
@@ -31,6 +34,13 @@ class PosePrior(NamedTuple):
         information = np.diag([np.inf] * 3 + [0.0] * 3)
         information[3:, 3:] = self.information[3:, 3:]
         return self._replace(information=information)
+
+    def unless_contradicted(self, T_world_camera: F64) -> "PosePrior":
+        """Return it, or none if a pose (4, 4) is many standard deviations away."""
+        origin = T_world_camera[:3, 3]
+        mean = shifted_motion(self.T_world_camera, origin)
+        cost = prior_cost(shifted_motion(T_world_camera, origin), mean, self.information)
+        return self if cost < _CONTRADICTION**2 else NO_PRIOR
 
 
 NO_PRIOR = PosePrior()

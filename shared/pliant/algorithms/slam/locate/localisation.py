@@ -8,9 +8,11 @@ import numpy as np
 from pliant.algorithms.arrays import F64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, move_by_similarity, so3_exp, so3_log
+from pliant.algorithms.inertial.gyro import GyroTurn
 from pliant.algorithms.slam.calibration.rolling_shutter import motion_between
 from pliant.algorithms.slam.estimate.absolute_pose import pose_by_ransac, truncated_cost
 from pliant.algorithms.slam.estimate.pose import Correspondences, refine_pose
+from pliant.algorithms.slam.estimate.pose_prior import NO_PRIOR, PosePrior
 from pliant.algorithms.slam.estimate.problem import BundleParameters
 from pliant.algorithms.slam.locate.inverse_depth import refine_moving_or_standing
 from pliant.algorithms.slam.parameters import LocalisationParameters
@@ -19,6 +21,10 @@ _COARSE_SIGMAS = 4.0
 """The kernel is first this many times wider, so that a poor prediction still converges."""
 
 _PREDICTION_GATE_PX = 20.0
+
+_START_PX = 0.3
+"""Standard deviation of the last pose's rotation from which the gyro starts: landmarks in one view
+err alike by about as much."""
 
 _SPEEDING_UP = 0.5
 """Share of its last acceleration that a prediction keeps: all of it amplifies noise."""
@@ -76,7 +82,25 @@ def refine(
     *,
     near: bool = False,
 ) -> Localisation:
-    """Refine a pose robustly, from a wide kernel to a narrow one; near: narrow immediately."""
+    """Refine a pose robustly, from a wide kernel to a narrow one; near: narrow immediately.
+
+    A prior that the pose contradicts is left out.
+    """
+    located = _refine(T_world_camera, seen, camera, parameters, near=near)
+    prior = seen.prior.unless_contradicted(located.T_world_camera)
+    if prior is seen.prior:
+        return located
+    return _refine(T_world_camera, seen._replace(prior=prior), camera, parameters, near=near)
+
+
+def _refine(
+    T_world_camera: F64,
+    seen: Correspondences,
+    camera: PinholeCamera,
+    parameters: LocalisationParameters,
+    *,
+    near: bool,
+) -> Localisation:
     is_pure_rotation, limit_px = False, parameters.inlier_px
     inliers = np.zeros(len(seen.points_px), np.bool_)
     for widening in (1.0,) if near else (_COARSE_SIGMAS, 1.0):
@@ -108,6 +132,7 @@ class Motion:
     tracked: tracked landmarks and helping candidates that support the newer one, as far as known.
     to_points: tracks that lead from it to landmarks alone.
     unmapped_s: from the last mapped frame to the newer one.
+    turn: what the gyro says of the camera since then, for the frame to come.
     """
 
     frames: tuple[int, int]
@@ -116,6 +141,7 @@ class Motion:
     tracked: int = 0
     to_points: int = 0
     unmapped_s: float = 0.0
+    turn: GyroTurn | None = None
 
     @staticmethod
     def at(frame: int, stamp_ns: int, T_world_camera: F64) -> "Motion":
@@ -185,11 +211,27 @@ class Motion:
         """Predict T_world_camera by constant velocity, and for a camera that has stopped."""
         last = self.poses[1]
         elapsed = self.stamps_ns[1] - self.stamps_ns[0]
+        stopped = last if self.turn is None else _turned(last, self.turn)
         if elapsed <= 0:
-            return [last]
+            return [stopped]
         share = (stamp_ns - self.stamps_ns[1]) / elapsed
         turn, shift = self._step
         moved = np.eye(4)
-        moved[:3, :3] = so3_exp(share * turn)
+        moved[:3, :3] = so3_exp(share * turn) if self.turn is None else self.turn.R
         moved[:3, 3] = share * shift
-        return [last @ moved, last]
+        return [last @ moved, stopped]
+
+    def prior(self, camera: PinholeCamera) -> PosePrior:
+        """What the gyro says of the frame's pose; nothing without it."""
+        if self.turn is None:
+            return NO_PRIOR
+        information = np.zeros((6, 6))
+        start = (_START_PX / camera.fx) ** 2 * np.eye(3)
+        information[3:, 3:] = np.linalg.inv(self.turn.covariance + start)
+        return PosePrior(_turned(self.poses[1], self.turn), information)
+
+
+def _turned(T_world_camera: F64, turn: GyroTurn) -> F64:
+    turned = T_world_camera.copy()
+    turned[:3, :3] = turned[:3, :3] @ turn.R
+    return turned

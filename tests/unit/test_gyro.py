@@ -1,0 +1,153 @@
+"""How the gyro tells the turns of a camera, and when it is not believed."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from inertial_motion import ADIS16448, PHONE, Motion, Sensor, hand_held, samples_of
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.geometry import so3_exp, so3_log
+from pliant.algorithms.inertial.alignment import averaged_signal
+from pliant.algorithms.inertial.gyro import Gyro, integrated
+from pliant.algorithms.inertial.samples import ImuSamples
+from pliant.algorithms.slam.adjust.carried_frames import carried_poses
+from pliant.algorithms.slam.adjust.ordinary_frames import EarlierPose
+from pliant.algorithms.slam.map.keyframe import Keyframe
+
+NOISE_RAD = np.radians(0.05)
+MOUNTED = so3_exp(np.array([0.4, 1.0, 2.0]))
+
+
+def samples(motion: Motion, sensor: Sensor = PHONE, offset_s: float = 0.08) -> ImuSamples:
+    return samples_of(
+        motion, sensor, np.random.default_rng(1), R_camera_imu=MOUNTED,
+        p_camera_imu=np.array([0.02, -0.01, 0.03]), offset_s=offset_s,
+    )  # fmt: skip
+
+
+def gyro_of(given: ImuSamples) -> Gyro:
+    gyro = Gyro.of(given)
+    assert gyro is not None
+    return gyro
+
+
+def seen(motion: Motion) -> F64:
+    """Rotations of the camera as images show them."""
+    noise = np.random.default_rng(2).normal(size=(len(motion.stamps_ns), 3))
+    return motion.T_world_camera(motion.times_s)[:, :3, :3] @ so3_exp(NOISE_RAD * noise)
+
+
+def shown(gyro: Gyro, stamps_ns: list[int], R: F64) -> None:
+    for (first, second), before, after in zip(pairwise(stamps_ns), R[:-1], R[1:], strict=True):
+        gyro.see(first, second, before.T @ after)
+
+
+def test_derivatives_of_an_integrated_turn() -> None:
+    signal = averaged_signal(samples(hand_held(5.0)), 1_000_000_000)
+    bias = np.array([0.1, -0.2, 0.3])
+    turn, by_bias, by_offset = integrated(signal, 1.003, 1.871, bias)
+    step = 1e-6
+    for axis, unit in enumerate(np.eye(3)):
+        moved, _, _ = integrated(signal, 1.003, 1.871, bias + step * unit)
+        np.testing.assert_allclose(so3_log(turn.T @ moved) / step, by_bias[:, axis], atol=1e-4)
+    moved, _, _ = integrated(signal, 1.003 + step, 1.871 + step, bias)
+    np.testing.assert_allclose(so3_log(turn.T @ moved) / step, by_offset, atol=1e-4)
+
+
+@pytest.mark.parametrize("sensor", [ADIS16448, PHONE])
+def test_turns_are_as_exact_as_they_claim(sensor: Sensor) -> None:
+    motion = hand_held(20.0)
+    gyro, R, stamps = gyro_of(samples(motion, sensor)), seen(motion), motion.stamps_ns.tolist()
+    true = motion.T_world_camera(motion.times_s)[:, :3, :3]
+    errors, squares = [], []
+    for now in range(1, len(stamps)):
+        before = now - 10
+        turn = gyro.turn(stamps[before], stamps[now]) if before >= 0 else None
+        if turn is not None:
+            e = so3_log(turn.R.T @ true[before].T @ true[now])
+            errors.append(np.linalg.norm(e))
+            squares.append(e @ np.linalg.solve(turn.covariance, e))
+        gyro.see(stamps[now - 1], stamps[now], R[now - 1].T @ R[now])
+    assert len(errors) > 0.6 * len(stamps)
+    assert np.degrees(max(errors)) < 0.4
+    assert 0.1 < np.mean(squares) < 4.0  # three numbers of unit variance
+
+
+def turned_back(given: ImuSamples) -> ImuSamples:
+    return replace(given, gyro_rad_s=given.gyro_rad_s[::-1].copy())
+
+
+def left_handed(given: ImuSamples) -> ImuSamples:
+    return replace(given, gyro_rad_s=given.gyro_rad_s[:, [1, 0, 2]])
+
+
+def in_degrees(given: ImuSamples) -> ImuSamples:
+    return replace(given, gyro_rad_s=np.degrees(given.gyro_rad_s))
+
+
+@pytest.mark.parametrize("spoil", [turned_back, left_handed, in_degrees])
+def test_a_gyro_of_something_else_is_never_believed(spoil) -> None:
+    motion = hand_held(20.0)
+    gyro = gyro_of(spoil(samples(motion)))
+    shown(gyro, motion.stamps_ns.tolist(), seen(motion))
+    assert not gyro.is_believed
+    assert gyro.turn(int(motion.stamps_ns[-2]), int(motion.stamps_ns[-1])) is None
+
+
+def test_the_gyro_of_a_stabilised_video_is_never_believed() -> None:
+    motion = hand_held(20.0)
+    turns = so3_log(seen(motion))
+    smooth = np.column_stack([np.convolve(each, np.ones(41) / 41, "same") for each in turns.T])
+    gyro = gyro_of(samples(motion))
+    shown(gyro, motion.stamps_ns.tolist(), so3_exp(smooth))
+    assert not gyro.is_believed
+
+
+def test_a_gyro_that_stops_to_fit_is_dropped() -> None:
+    motion = hand_held(20.0)
+    given = samples(motion)
+    late = np.arange(len(given.stamps_ns)) > len(given.stamps_ns) // 2
+    frozen = replace(given, gyro_rad_s=np.where(late[:, None], 0.0, given.gyro_rad_s))
+    gyro = gyro_of(frozen)
+    shown(gyro, motion.stamps_ns.tolist(), seen(motion))
+    assert gyro.is_believed
+    assert gyro.dropped
+    assert gyro.turn(int(motion.stamps_ns[150]), int(motion.stamps_ns[151])) is None
+
+
+def test_a_gap_in_the_samples_has_no_turn() -> None:
+    motion = hand_held(20.0)
+    given = samples(motion, offset_s=0.0)
+    times_s = 1e-9 * (given.stamps_ns - motion.origin_ns)
+    kept = (times_s < 15.0) | (times_s > 15.3)
+    gyro = gyro_of(ImuSamples(**{name: values[kept] for name, values in vars(given).items()}))
+    shown(gyro, motion.stamps_ns.tolist(), seen(motion))
+    at = {second: motion.origin_ns + round(1e9 * second) for second in (14.5, 14.95, 15.25, 15.5)}
+    assert gyro.turn(at[14.5], at[14.95]) is not None
+    assert gyro.turn(at[14.95], at[15.25]) is None
+    assert gyro.turn(at[14.5], at[15.5]) is None
+
+
+def test_frames_of_a_gap_get_poses_by_the_gyro() -> None:
+    motion = hand_held(20.0)
+    stamps, T = motion.stamps_ns.tolist(), motion.T_world_camera(motion.times_s)
+    gyro = gyro_of(samples(motion))
+    shown(gyro, stamps, seen(motion))
+    keyframe = Keyframe(
+        id=0, frame=0, segment=0, T_world_camera=np.eye(4), rows=np.zeros(0, np.int32),
+        points_px=np.zeros((0, 2), np.float32), rolled_px=np.zeros((0, 2), np.float32),
+    )  # fmt: skip
+    lost = [*range(100, 110), *range(200, 230)]  # half a second, and more than can be bridged
+    placed = [
+        EarlierPose(frame=number, keyframe=keyframe, T_world_camera=T[number], inliers=100)
+        for number in range(len(stamps))
+        if number not in lost
+    ]
+    carried = carried_poses(placed, dict(enumerate(stamps)), lost, gyro)
+    assert [each.frame for each in carried] == lost[:10]
+    for each in carried:
+        off = so3_log(T[each.frame][:3, :3].T @ each.T_world_camera[:3, :3])
+        assert np.degrees(np.linalg.norm(off)) < 0.1
+        assert np.linalg.norm(T[each.frame][:3, 3] - each.T_world_camera[:3, 3]) < 0.01
