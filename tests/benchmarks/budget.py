@@ -308,8 +308,10 @@ def _short(budgets: Sequence[Budget]) -> Iterator[str]:
 def _tables(source: str, budgets: Sequence[Budget]) -> Iterator[str]:
     budget = _middle(budgets)
     yield (
-        f"{source}: {budget.frames} frames, {budget.frames_per_second:.1f} frames/s, "
-        f"{budget.frame_ms:.1f} ms of CPU a frame, {budget.resident_mib:.0f} MiB at once; "
+        f"{Path(source).name}: {budget.frames} frames, {budget.frames_per_second:.1f} frames/s, "
+        f"{budget.frame_ms:.1f} ms of CPU a frame, {budget.resident_mib:.0f} MiB at once"
+    )
+    yield (
         f"first image recorded after {budget.first_image_s:.2f} s, "
         f"first pose after {budget.first_pose_s:.2f} s"
     )

@@ -212,6 +212,7 @@ TABLES: dict[str, Table] = {
         final_online,
     ),
     "light-cpu": Table(12, (f"{_BENCH} light built-in:room tum_fr1_xyz 7scenes_redkitchen400",)),
+    "budget": Table(2, (f"{_BENCH} budget 7scenes_redkitchen400",)),
     "codec": Table(1, (f"{_BENCH} codec",)),
     "ceres": Table(10, (f"{_BENCH} bundle --problems bundle_adjustment --plot bundle.png",)),
     "meshing": Table(
