@@ -18,9 +18,9 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I64, U8, BoolArray
 from pliant.algorithms.surfels import deformation_models as models
+from pliant.algorithms.surfels.brightness import add_light, measured_brightness
 from pliant.algorithms.surfels.deformation_graph import Edges, edge_rows, pull_of_edges, torn_off
 from pliant.algorithms.surfels.deformation_models import RIGID
-from pliant.algorithms.surfels.light import add_light, measured_brightness
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.patch_sampling import GAIN, Level, X
 from pliant.algorithms.surfels.surfel_alignment import (
@@ -301,7 +301,7 @@ def align_graph(
     poses: (N, POSE_FLOATS) in the camera's frame.  start: the same of the last frame: from there
     what is not seen is carried.  active: (N,) 1 where the image may be looked at.  equilibrium: of
     Eq. 20 for a camera that is held; the pairs know nothing of it, since a motion of all leaves
-    them as they are.  births: (N,) brightness at birth (``light``), where the lamp is at the
+    them as they are.  births: (N,) brightness at birth (``brightness``), where the lamp is at the
     camera.  Returns (N,) which surfels have torn themselves off their neighbours: their
     pose is that of ``start``.
     """

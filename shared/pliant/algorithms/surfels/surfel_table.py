@@ -6,6 +6,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.surfels.births import Births, join, select
+from pliant.algorithms.surfels.brightness import brightness
 from pliant.algorithms.surfels.deformation_graph import (
     Edges,
     find_edges,
@@ -15,7 +16,6 @@ from pliant.algorithms.surfels.deformation_graph import (
     no_edges,
 )
 from pliant.algorithms.surfels.deformation_models import move_poses
-from pliant.algorithms.surfels.light import brightness
 from pliant.algorithms.surfels.patch_sampling import BIAS, GAIN, POSE_FLOATS, A, B, F, X
 from pliant.algorithms.surfels.surfel_alignment import Templates
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
@@ -50,7 +50,7 @@ class SurfelTable:
     poses: F64 = field(default_factory=lambda: np.zeros((0, POSE_FLOATS)))  # last good ones
     rest: F64 = field(default_factory=lambda: np.zeros((0, 3)))  # X^0 of Eq. 20, world
     sigmas: F64 = field(default_factory=lambda: np.zeros(0))  # root of its Sigma, metres
-    brightness: F64 = field(default_factory=lambda: np.zeros(0))  # at birth, see ``light``
+    brightness: F64 = field(default_factory=lambda: np.zeros(0))  # at birth, see ``brightness``
     ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
     state: U8 = field(default_factory=lambda: np.zeros(0, np.uint8))
     born: I32 = field(default_factory=lambda: np.zeros(0, np.int32))

@@ -6,7 +6,7 @@ from surfel_scene import STEP_S
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.surfels import deformation_models as models
-from pliant.algorithms.surfels.light import brightness, brightness_row, measured_brightness
+from pliant.algorithms.surfels.brightness import brightness, brightness_row, measured_brightness
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.patch_sampling import BIAS, GAIN, A, B, F, X
 from pliant.algorithms.surfels.surfel_alignment import Limits, add_isometry, isometry_cost
