@@ -1,4 +1,4 @@
-"""What was agreed on in the holes of a keyframe's depth map."""
+"""Depth of the small image in the holes of a keyframe's depth map."""
 
 import numpy as np
 import pytest
@@ -10,15 +10,13 @@ from pliant.algorithms.meshing.parameters import TsdfParameters
 from pliant.algorithms.meshing.rendering import DepthMap
 from pliant.algorithms.meshing.tsdf_volume import TsdfVolume
 from pliant.algorithms.stereo.filling import filled
-from pliant.algorithms.stereo.views import DenseDepth, shrunk_camera
+from pliant.algorithms.stereo.views import shrunk_camera
 
 GREY = np.full((CAMERA.height, CAMERA.width, 3), 128, np.uint8)
 
 
-def agreed(times: int, support: float = 6.0) -> DenseDepth:
-    small = shrunk_camera(CAMERA, times)
-    depth = true_depth(pose(0), small)
-    return DenseDepth(1.0 / depth, np.full(depth.shape, support, np.float32))
+def known(times: int) -> F32:
+    return (1.0 / true_depth(pose(0), shrunk_camera(CAMERA, times))).astype(np.float32)
 
 
 def with_hole(depth: F32, weight: float = 0.5) -> DepthMap:
@@ -32,7 +30,7 @@ def with_hole(depth: F32, weight: float = 0.5) -> DepthMap:
 def test_holes_are_filled_faintly_and_the_surface_stays(times: int) -> None:
     true = true_depth(pose(0))
     before = with_hole(true)
-    after = filled(before, agreed(times), times)
+    after = filled(before, known(times), times)
     hole = before.depths == 0.0
     np.testing.assert_array_equal(after.depths[~hole], before.depths[~hole])
     np.testing.assert_array_equal(after.weights[~hole], before.weights[~hole])
@@ -43,16 +41,9 @@ def test_holes_are_filled_faintly_and_the_surface_stays(times: int) -> None:
     assert not before.depths[hole].any()
 
 
-def test_what_few_agree_on_fills_nothing() -> None:
-    before = with_hole(true_depth(pose(0)))
-    after = filled(before, agreed(2, support=1.0), 2)
-    np.testing.assert_array_equal(after.depths, before.depths)
-
-
 def test_the_rest_of_a_size_that_does_not_divide_stays_bare() -> None:
     nothing = np.zeros((7, 9), np.float32)
-    some = DenseDepth(np.full((3, 4), 0.5, np.float32), np.full((3, 4), 9.0, np.float32))
-    after = filled(DepthMap(nothing, nothing), some, 2)
+    after = filled(DepthMap(nothing, nothing), np.full((3, 4), 0.5, np.float32), 2)
     assert (after.depths[:6, :8] == 2.0).all()
     assert not after.depths[6:].any()
     assert not after.depths[:, 8:].any()
@@ -69,7 +60,7 @@ def fused(*maps: DepthMap) -> TriangleMesh:
 
 def test_one_keyframe_with_a_surface_outweighs_many_that_fill() -> None:
     true = true_depth(pose(0), ball=False)
-    wrong = DenseDepth(1.0 / (1.03 * true), np.full(true.shape, 9.0, np.float32))
+    wrong = (1.0 / (1.03 * true)).astype(np.float32)
     bare = DepthMap(np.zeros_like(true), np.zeros_like(true))
     guess = filled(bare, wrong, 1)
     surface = DepthMap(true, np.ones_like(true))

@@ -114,4 +114,4 @@ def _warm_up_stereo(camera: PinholeCamera, points: SeenPoints) -> None:
         (agreed,) = dense.agreed([0])
         dense.with_sure_pixels(0, points, agreed)
         nothing = np.zeros((camera.height, camera.width), np.float32)
-        dense.filled(DepthMap(nothing, nothing), agreed)
+        dense.filled(0, DepthMap(nothing, nothing), agreed)

@@ -20,6 +20,7 @@ from pliant.algorithms.meshing.rendering import DepthMap
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.stereo.consensus import consensus
 from pliant.algorithms.stereo.dense_points import matching_sigmas, sure_pixels
+from pliant.algorithms.stereo.extension import extended, reduced
 from pliant.algorithms.stereo.filling import filled
 from pliant.algorithms.stereo.sources import SAMPLES, Viewpoints, choose_sources
 from pliant.algorithms.stereo.sweep import Anchors, swept_depth
@@ -167,9 +168,15 @@ class DenseDepths:
                 agreed = next(results)
             yield agreed
 
-    def filled(self, depth_map: DepthMap, agreed: DenseDepth | None) -> DepthMap:
-        """The depth map of a keyframe, and what was agreed on where that shows nothing."""
-        return depth_map if agreed is None else filled(depth_map, agreed, self._times)
+    def filled(self, keyframe: int, depth_map: DepthMap, agreed: DenseDepth | None) -> DepthMap:
+        """The depth map of a keyframe; where that shows nothing, the surfaces around are extended,
+        or what was agreed on counts."""
+        if agreed is None:
+            return depth_map
+        sources = [self._view(other) for other in self._around[keyframe][:_SOURCES]]
+        surface = reduced(depth_map.depths, self._times)
+        more = extended(surface, agreed, self._view(keyframe), sources)
+        return filled(depth_map, more, self._times)
 
     def with_sure_pixels(
         self, keyframe: int, seen: SeenPoints, agreed: DenseDepth | None

@@ -316,7 +316,8 @@ class Mesher:
             if surface.depth_map is None or colour is None:
                 problem = f"keyframe {keyframe}: {surface.problem or _NO_IMAGE}"
                 continue
-            depth_map = dense.filled(surface.depth_map, agreed)
+            with timer("dense filling"):
+                depth_map = dense.filled(keyframe, surface.depth_map, agreed)
             depth_map = self._within(keyframe, depth_map, correction)
             for level, volume in volumes.items():
                 with timer(f"final {level} fusion"):

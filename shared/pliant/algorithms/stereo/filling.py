@@ -1,4 +1,4 @@
-"""Depth that keyframes agree on, where a keyframe has no surface of its own.
+"""Depth where a keyframe has no surface of its own.
 
 Between points that are not sure, across jumps and on slants a keyframe's surface has holes.  What
 its images say there is worth less than any surface, yet better than nothing: it enters with a
@@ -9,24 +9,19 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32
 from pliant.algorithms.meshing.rendering import DepthMap
-from pliant.algorithms.stereo.views import DenseDepth
 from pliant.compiler.kernel import kernel
 
 _WEIGHT = 0.01
 """A surface face on, of certain depth, has 1."""
-_MIN_SUPPORT = 1.5
-"""As many confident views agree."""
 _ONE_SURFACE = 0.03
 """Share of the inverse depth by which pixels side by side on one surface differ at most."""
 
 
-def filled(depth_map: DepthMap, agreed: DenseDepth, times: int) -> DepthMap:
-    """A keyframe's depth map (H, W), with what was agreed on in the place of nothing.
+def filled(depth_map: DepthMap, inverse_depths: F32, times: int) -> DepthMap:
+    """A keyframe's depth map (H, W), with other depth in the place of nothing.
 
-    agreed: (h, w) as of ``consensus``, of the image ``times`` smaller; h = H // times.
+    inverse_depths: (h, w), 0: unknown, of the image ``times`` smaller; h = H // times.
     """
-    usable = (agreed.inverse_depths > 0.0) & (agreed.confidences > _MIN_SUPPORT)
-    inverse_depths = np.where(usable, agreed.inverse_depths, np.float32(0.0))
     depths, weights = depth_map.depths.copy(), depth_map.weights.copy()
     if inverse_depths.size:
         _fill(inverse_depths, times, depths, weights)

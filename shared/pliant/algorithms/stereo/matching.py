@@ -24,7 +24,7 @@ WORST = 255
 """Cost of windows that do not correlate, as many as the same grey everywhere."""
 _UNITS = 16
 """Of one grey level, so that sums over windows are whole numbers and exact."""
-_NOISE_VARIANCE = 4.0
+NOISE_VARIANCE = 4.0
 """Of a pixel of the small images: noise, JPEG, interpolation; grey levels squared."""
 _OUTSIDE = 3.0
 """Cost of what an image does not show, before it is left out: above all others."""
@@ -199,7 +199,7 @@ def _correlate(
             for u in range(width):
                 total[u] += moved[u]
     n = np.float32((2 * radius + 1) ** 2)
-    noise = np.float32(_NOISE_VARIANCE * _UNITS**2) * n * n
+    noise = np.float32(NOISE_VARIANCE * _UNITS**2) * n * n
     zero, one, outside = np.float32(0.0), np.float32(1.0), np.float32(_OUTSIDE)
     of_s, of_ss, of_rs = rows[0], rows[1], rows[2]
     for u in range(width):
