@@ -40,12 +40,16 @@ BANNED = {
     r"causal": "online",
     r"so-manyth": "every Nth",
     r"(a|the) run says|the end of a run says": "the summary shows",
-    r"nobody('s| describes)": "name the subject",
+    r"nobody": "name the subject",
     r"(?<!ground[ -])truth": "ground truth",
     r"(goes|went) on": "continues, resumes",
     r"(gives|gave|given) up": "drops, stops",
     r"unsays?": "overrides",
     r"what (is|was) (seen|found|known|lost|told)": "name the thing",
+    r"(is|are|was|were|be|being) said": "is given, reported, configured",
+    r"says? (of|nothing)": "name the subject; has no effect",
+    r"somebody": "name the subject",
+    r"so many(?! \w+ that| that)": "this many, that many",
 }
 
 

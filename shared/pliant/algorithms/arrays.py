@@ -34,7 +34,7 @@ class Shape(tuple[int | str, ...]):
 
 @dataclass(frozen=True)
 class ArrayField:
-    """What a record's annotation says of one of its array fields."""
+    """The annotation of an array field of a record."""
 
     name: str
     dtype: np.dtype[Any]
@@ -61,7 +61,7 @@ def _scalar_type(array_type: Any) -> Any:
 
 
 def with_bits(values: F32, bits: int) -> F32:
-    """Finite numbers to so many significant bits, 1 to 23: what is left of them takes little room
+    """Finite numbers to that many significant bits, 1 to 23: what is left of them takes little room
     where it is compressed."""
     dropped = 24 - bits
     whole = np.ascontiguousarray(values).view(np.uint32) + np.uint32(1 << (dropped - 1))
@@ -69,7 +69,7 @@ def with_bits(values: F32, bits: int) -> F32:
 
 
 def check_arrays(record: Any) -> None:
-    """Raise ValueError, naming the field, where an array is not what its annotation says."""
+    """Raise ValueError, naming the field, where an array differs from its annotation."""
     sizes: dict[str, tuple[int, str]] = {}
     for spec in array_fields(type(record)):
         value = getattr(record, spec.name)

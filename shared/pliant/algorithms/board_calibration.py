@@ -4,8 +4,8 @@ Boards are chessboards and ChArUco.  A board's own plane has x along its columns
 rows, in squares, from its top left.  OpenCV finds the corners: Duda and Frese 2018 for chessboards,
 ArUco's markers for the others.
 
-The least squares are OpenCV's (Zhang 2000).  What they say of themselves is too sure, as the errors
-of one view go together: the uncertainty is that of leaving views out in turn (the jackknife).
+The least squares are OpenCV's (Zhang 2000).  Their own standard deviations are too small, as errors
+of one view correlate: the uncertainty is that of leaving views out in turn (the jackknife).
 """
 
 from collections.abc import Sequence
@@ -28,9 +28,9 @@ DICTIONARIES: dict[str, int] = {
 """ArUco's dictionaries of markers by the names of OpenCV, in small letters."""
 _LARGEST = ("4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000", "apriltag_36h11", "aruco_original")
 _MIN_CORNERS = 8
-"""Fewer say less of the camera than of where the board is."""
+"""Fewer corners determine the pose of the board, but hardly the camera."""
 _SEEN_MARKERS = 4
-"""So many at once are no accident."""
+"""This many at once are not found by chance."""
 
 BoardLens: TypeAlias = Literal["pinhole-radtan", "fisheye"]
 
@@ -85,7 +85,7 @@ class Board:
 
 @dataclass(frozen=True)
 class BoardView:
-    """What one image shows of a board: (N, 2) corners on the board, and their (N, 2) pixels."""
+    """The board in one image: (N, 2) corners on the board, and their (N, 2) pixels."""
 
     corners: F64
     points_px: F64

@@ -1,4 +1,4 @@
-"""What one frame changes in the map and in its keyframes' observations: all that is published.
+"""The changes of one frame in the map and in its keyframes' observations: all that is published.
 
 One atomic update a frame."""
 

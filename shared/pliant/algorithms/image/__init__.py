@@ -1,1 +1,1 @@
-"""What kernels do with grey levels: smaller images, and small patches that are aligned."""
+"""Kernels on grey levels: smaller images, and the alignment of small patches."""

@@ -13,7 +13,7 @@ _COMBED = 1.25
 
 
 def is_combed(image: U8) -> bool:
-    """Whether the rows of an (H, W, 3) image are of two times, whatever its file says."""
+    """Whether the rows of an (H, W, 3) image are of two times, marked so or not."""
     if not 2 < image.shape[0] <= _LINES:
         return False
     rows = image[:, ::_COLUMNS, 1].astype(np.int16)

@@ -1,6 +1,6 @@
 """Parts of images that show nothing of the scene: what moves with the camera, or by itself.
 
-A mask says of each pixel whether it is used.  It travels as a PNG of one bit a pixel, and is worked
+A mask marks the pixels that are used.  It travels as a PNG of one bit a pixel, and is worked
 with as the *clearance*: (H, W) float32, how many pixels the nearest that is not used lies away, the
 larger of the distances along the two axes; 0 where it is not used itself.
 """

@@ -28,7 +28,7 @@ MIN_STRENGTH = np.float32(1e-4)
 
 
 class PatchTensor(NamedTuple):
-    """What there is to see in a patch.
+    """The texture of a patch.
 
     level + mean: the mean grey level.  mean_x, mean_y: the mean gradient.  energy: the sum of
     squares without the mean.  tx, ty: how much of the patch is in each gradient image, per unit of

@@ -60,7 +60,7 @@ def sharpness(grey: U8) -> float:
 
 
 def resized(image: U8, side: int) -> U8:
-    """An (H, W) or (H, W, 3) image with so many pixels along its longer side, by areas."""
+    """An (H, W) or (H, W, 3) image, resized by areas to a longer side of that many pixels."""
     height, width = image.shape[:2]
     if side >= max(height, width):
         return image
@@ -68,7 +68,7 @@ def resized(image: U8, side: int) -> U8:
 
 
 def size_at(width: int, height: int, side: int) -> tuple[int, int]:
-    """(width, height) of an image with so many pixels along its longer side."""
+    """(width, height) of an image whose longer side has that many pixels."""
     longer = max(width, height)
     return round(width * side / longer), round(height * side / longer)
 

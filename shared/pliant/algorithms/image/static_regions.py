@@ -65,7 +65,7 @@ _ROUND_SHARE = 0.8
 _SECTORS = 36
 _FITS = 3
 """A circle: this share of the outline is so round, as a share of the longer side, in at least half
-of so many sectors.  It is fitted so often, without what is far from it."""
+of that many sectors.  It is fitted so often, without what is far from it."""
 
 _STRAIGHT = 0.97
 """Bars leave this share of the rectangle around what they leave."""
@@ -126,7 +126,7 @@ class StaticRegions:
         return self._counted in _DECISIONS
 
     def decide(self, size: tuple[int, int]) -> StaticMask | None:
-        """What does not move, for images of a size (width, height); None: nothing.  Called once
+        """The static area, for images of a size (width, height); None: nothing.  Called once
         whenever it is time: an overlay is one that was found the last time as well."""
         means = (self._sums / self._counted).astype(np.float32)
         self.decisions += 1
@@ -193,7 +193,7 @@ def _border(means: F32) -> tuple[str, BoolArray]:
 
 
 def _outside_circle(outline: BoolArray, steady: BoolArray) -> BoolArray | None:
-    """What lies outside of the circle that the outline is, if it is one and all outside is steady.
+    """The area outside of the outline, if that is a circle and all outside is steady.
 
     A dark part of the scene that stays beside the border for a while opens the outline, not the
     circle.

@@ -1,4 +1,4 @@
-"""What the kernels' hand-written vector instructions have in common, and prefetching."""
+"""Common parts of the kernels' hand-written vector instructions, and prefetching."""
 
 from typing import Any, cast
 
@@ -12,7 +12,7 @@ _I32 = ir.IntType(32)
 
 
 def vector_type(lanes: int) -> Any:
-    """Type of so many float32 lanes."""
+    """Type of a vector of that many float32 lanes."""
     return ir.VectorType(ir.FloatType(), lanes)
 
 

@@ -77,7 +77,7 @@ class InertialAlignment:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why samples say nothing reliable of a trajectory: one line, with figures."""
+    """Why samples determine nothing reliable of a trajectory: one line, with figures."""
 
     reason: str
 

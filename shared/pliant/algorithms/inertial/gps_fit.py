@@ -7,7 +7,7 @@ A fix p_i (east, north, up) with covariance C_i, at time t_i, and the trajectory
 m is the mean of the trajectory, so that c, the place of the middle, is nearly independent of scale
 s and rotation R (Umeyama 1991 has the closed form for C_i = 1 and tau = 0).  tau is the offset of
 the receiver's clock from the camera's.  k is the factor by which fixes are worse, or better, than
-their receiver says; where it says nothing, C_i is that of 1 m, and k is the error in metres.
+their receiver reports; without a report C_i is that of 1 m, and k is the error in metres.
 
 The unknowns (log s, omega, c, tau), R <- exp(omega) R, are found by Gauss-Newton.  With
 v_i = s R (x_i - m) and the velocity w_i = s R dx/dt, the residual r_i = p_i - c - v_i has
@@ -43,7 +43,7 @@ satellites (Langley, GPS World 1999: typical VDOP / HDOP)."""
 _CAUCHY = 2.385
 """In sigmas: 95 % efficiency for normal errors (Holland and Welsch 1977)."""
 _VAGUE = 1e-12
-"""Information that keeps the equations regular where fixes say nothing, as of a height."""
+"""Information that keeps the equations regular where fixes have no component, such as a height."""
 _ROUNDS = 30
 _START_ROUNDS = 5
 _TRIMMED = 0.7

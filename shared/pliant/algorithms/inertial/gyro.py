@@ -55,8 +55,8 @@ _APART = 0.3
 is explained."""
 _SIGMAS = 3.0
 _PROOFS, _OF = 8, 10
-"""So many of the last intervals must agree before the gyro is believed, and it no longer is when so
-many of them contradict it."""
+"""This many of the last intervals must agree before the gyro is believed, and contradict it before
+it no longer is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +133,7 @@ class Gyro:
         return self._turned(aligned, first_ns, second_ns)
 
     def see(self, first_ns: int, second_ns: int, R_first_second: F64) -> None:
-        """Take in what the images say of the turn between successive frames."""
+        """Take in the rotation between successive frames by the images."""
         if self.dropped:
             return
         self.frames += self.is_believed

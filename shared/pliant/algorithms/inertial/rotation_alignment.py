@@ -37,7 +37,7 @@ _LONGEST_GAP = 4.0
 _LEAST_OVERLAP_S = 3.0
 _TINY = 1e-12
 _ONE_AXIS = 0.05
-"""Of the squares of angular velocity, what is not about the main axis: less says nothing of the
+"""Of the squares of angular velocity, what is not about the main axis: less does not determine the
 rotation about it."""
 _STARTS = 8
 

@@ -34,7 +34,7 @@ _FOLD_COSINE = 0.2
 
 
 def decimated(positions: F32, colours: U8, triangles: I32, most: int) -> tuple[F32, U8, I32]:
-    """A mesh of at most so many triangles, without vertices that none of them has.
+    """A mesh of at most that many triangles, without vertices that none of them has.
 
     positions, colours: (V, 3).    triangles: (T, 3).  Which way they turn stays.  It has more
     where the edges that are left folded when they were tried.
@@ -70,7 +70,7 @@ def decimated(positions: F32, colours: U8, triangles: I32, most: int) -> tuple[F
 
 
 def clustered(positions: F32, colours: U8, triangles: I32, most: int) -> tuple[F32, U8, I32]:
-    """A mesh of at most so many triangles: the vertices in each cell of a grid become their mean.
+    """A mesh of at most that many triangles: the vertices in each cell of a grid become their mean.
 
     Rossignac and Borrel 1993: coarse, and in memory that is a few times the mesh's own.
     """
@@ -162,7 +162,7 @@ def _parts(count: int) -> Iterator[slice]:
 
 
 def _cheapest(edges: I64, places: F64, quadrics: F64, most: int) -> tuple[I64, F64]:
-    """(C,) edges that collapse together, at most so many, and (C, 3) what they become."""
+    """(C,) edges that collapse together, at most that many, and (C, 3) what they become."""
     u, v = np.divmod(edges, len(places))
     onto, costs = np.empty((len(edges), 3)), np.empty(len(edges))
     for rows in _parts(len(edges)):
@@ -182,7 +182,7 @@ def _collapses(u: I64, v: I64, places: F64, quadrics: F64) -> tuple[F64, F64]:
     """(E, 3) what edges from u to v become, and (E,) what that costs."""
     both = quadrics[u] + quadrics[v]
     middle, apart = 0.5 * (places[u] + places[v]), places[u] - places[v]
-    # By the middle, where little is to be said: along a plane.
+    # By the middle, where the quadric determines little: along a plane.
     A = both[:, :3, :3]
     stiff = _EVEN * np.trace(A, axis1=1, axis2=2) + 1e-300
     shift = -(both[:, :3, 3] + np.einsum("nij,nj->ni", A, middle))

@@ -35,7 +35,7 @@ _PAD = SIDE + 3
 _END = np.float32(0.01)
 """Vertices keep this share of an edge from its ends, so that no triangle is without area."""
 MAX_STEPS = 3.0
-"""A cut edge may change by so many voxels' worth of distance.  A true distance has one."""
+"""A cut edge may change by this many voxels' worth of distance.  A true distance has one."""
 _VERTEX = 9
 """Values of a vertex: position, normal, colour."""
 

@@ -21,19 +21,19 @@ _RIDGE = 0.02
 _MAX_RING = 32
 """Neighbours of a vertex that are looked at."""
 _TOLERANCE = 2.0
-"""Neighbours agree within so many sigmas, or so many times what is usual on a slope."""
+"""Neighbours agree within this many sigmas, or times the usual difference on a slope."""
 _ENOUGH = 2.5
 """Neighbours that must agree with a vertex for it to keep its data (6 is usual)."""
 _PASSES = 8
 _SLACK_DECAY = 0.5
 """From pass to pass, of what is added to sigma: in the end slopes explain a steep surface."""
 _DATA_SIGMAS = 3.0
-"""Data off the surface by so many sigmas hold it half as much as one neighbour does."""
+"""Data off the surface by this many sigmas hold it half as much as one neighbour does."""
 _SLOPE_INERTIA = 0.5
 """How much a vertex's own slope counts beside one neighbour's."""
 _ONE, _HALF = np.float32(1.0), np.float32(0.5)
 _APART = 6.0
-"""Surfaces so many sigmas apart at a vertex are two."""
+"""Surfaces this many sigmas apart at a vertex are two."""
 _FEWEST = 3
 """Neighbours that another surface needs."""
 _MOST = 512
@@ -255,11 +255,11 @@ def change_sides(graph: Graph, edges: I32, halves: F32, state: F32, sigmas: floa
 
 @fast_kernel
 def choose_sides(graph: Graph, state: F32, sigmas: float) -> int:
-    """Move vertices whose data say nothing to the side of a step where they lie; how many.
+    """Move vertices whose data count for nothing to the side of a step where they lie; how many.
 
     An outlier has a place, though no inverse depth.  Where neighbours and theirs are on two
     surfaces, the line that separates the two best (least squares of +-1, nearer ones heavier)
-    says on which side the vertex is.    sigmas: data farther off the surface say nothing.
+    has the side of the vertex.    sigmas: data farther off the surface count for nothing.
     """
     u, v, data, sigma, starts, neighbours = graph
     seen, far = np.empty((_MOST, 4), np.float32), np.zeros(len(state), np.bool_)

@@ -20,7 +20,7 @@ _GUTTER_TEXELS = 2
 _SCALES = 24
 """Steps by halves towards the largest scale at which a texture holds a mesh."""
 _MIN_COSINE = 0.2
-"""Of the slant: more slanted views say nothing of a texel."""
+"""Of the slant: more slanted views do not colour a texel."""
 _DEPTH_TOLERANCE = 0.03
 """Share of its depth by which what a view sees may lie before or behind a texel."""
 _BORDER = 0.1

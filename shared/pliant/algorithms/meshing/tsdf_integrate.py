@@ -39,13 +39,13 @@ TILE_PX = 16
 _MIN_COSINE = 0.1
 """A surface more slanted than this is a step: it is taken at right angles to the view."""
 _MAX_BEHIND = 2.0
-"""Truncations behind the surface along z beyond which a grazed plane says nothing."""
+"""Truncations behind the surface along z beyond which a grazed plane has no effect."""
 _NEAR = 1e-3
 _MAX_STRIDE_PX = 8
 _RAYS_PER_BLOCK = 6
 """Rays side by side that meet the most distant block, so that none is missed."""
 _MAX_STRETCH = 2.0
-"""The band along a ray is the truncation over the cosine of the slant, up to so many times."""
+"""The band along a ray is the truncation over the cosine of the slant, up to this many times."""
 
 
 class PixelPlanes(NamedTuple):

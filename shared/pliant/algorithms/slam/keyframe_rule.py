@@ -9,7 +9,7 @@ the image, and the camera has hardly moved, noise or blur ended their tracks: a 
 nothing new, and would only map new tracks that end as soon.  It waits until fewer remain.
 
 Landmarks are counted, not all tracks: in a noisy image most tracks are noise that ends within a
-frame or two and says nothing about the view.  Candidates count only if a frame shares fewer
+frame or two and is no evidence of the view.  Candidates count only if a frame shares fewer
 landmarks with the last keyframe than a start needs.
 """
 

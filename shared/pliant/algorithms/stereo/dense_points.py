@@ -31,7 +31,7 @@ def sure_pixels(
     """Pixels with much support away from the map's own points.
 
     depth: as of ``consensus``.    points_px: (N, 2) the map's, in pixels of the view.
-    stride: every so many rows and columns.    min_support: as many confident views agree.
+    stride: in rows and columns.    min_support: as many confident views agree.
     """
     height, width = depth.confidences.shape
     c = _CLEAR_STRIDES * stride

@@ -45,7 +45,7 @@ class LastSharp:
 
 
 def are_lost(before: int, now: int) -> bool:
-    """Whether so many tracks were lost that the frame before is worth storing."""
+    """Whether enough tracks were lost to store the frame before."""
     return before >= _LEAST and now < (1.0 - LOST_AT_ONCE) * before
 
 

@@ -57,7 +57,7 @@ and 9 % where the views overlap; the fastest rotations with blur leave 11 to 20 
 
 
 class Located(NamedTuple):
-    """T_world_camera of a frame.   is_firm: it has so many tracks that the view was not cut."""
+    """T_world_camera of a frame.   is_firm: it has enough tracks to exclude a cut of the view."""
 
     T_world_camera: F64
     is_firm: bool

@@ -349,7 +349,7 @@ def _solve_both(L: F64, b: F64, out: F64) -> None:
 def _smooth(
     means: F64, all_P: F64, all_K: F64, all_L: F64, all_v: F64, adjoints: F64, dt: F64, states: F64
 ) -> None:
-    """Modified Bryson-Frazier: lam carries what later frames say of each one's state."""
+    """Modified Bryson-Frazier: lam carries the information of later frames on each state."""
     N = means.shape[0]
     lam, moved, z, back = np.zeros(12), np.zeros(12), np.zeros(6), np.zeros(12)
     for n in range(N - 1, -1, -1):

@@ -29,7 +29,7 @@ def triangulate(
 
     T_world_camera: (M, 4, 4).  u, v, seen: (M, N) observations.  columns: (C,) points wanted.
     Returns xyz (C, 3) in the world, the largest reprojection error (C,) in px, inf where the rays
-    do not meet before all cameras, and what ``spread_of_rays`` says of each.
+    do not meet before all cameras, and the ``spread_of_rays`` of each.
     """
     xyz = np.empty((len(columns), 3))
     errors = np.empty(len(columns), np.float32)

@@ -72,7 +72,7 @@ def placed_candidates(points: Landmarks, rows: I32) -> I64:
 
 
 def helping_candidates(points: Landmarks, rows: I32) -> I64:
-    """As ``placed_candidates``; none where so many of the rows are mapped that they suffice."""
+    """As ``placed_candidates``; none where enough of the rows are mapped."""
     others, mapped = _placed(rows, points.state, points.spread)
     return others if mapped < MAPPED_SHARE * (mapped + len(others)) else others[:0]
 

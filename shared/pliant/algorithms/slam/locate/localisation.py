@@ -132,7 +132,7 @@ class Motion:
     tracked: tracked landmarks and helping candidates that support the newer one, as far as known.
     to_points: tracks that lead from it to landmarks alone.
     unmapped_s: from the last mapped frame to the newer one.
-    turn: what the gyro says of the camera since then, for the frame to come.
+    turn: the rotation of the camera since then by the gyro, for the frame to come.
     """
 
     frames: tuple[int, int]
@@ -222,7 +222,7 @@ class Motion:
         return [last @ moved, stopped]
 
     def prior(self, camera: PinholeCamera) -> PosePrior:
-        """What the gyro says of the frame's pose; nothing without it."""
+        """The pose of the frame by the gyro; nothing without it."""
         if self.turn is None:
             return NO_PRIOR
         information = np.zeros((6, 6))

@@ -66,7 +66,7 @@ def _kept(rows: I32, points_px: F32, rolled_px: F32, mask: BoolArray) -> tuple[I
 
 @kernel
 def _room_for(count: int) -> tuple[I32, F32, F32]:
-    """Rows, points_px and rolled_px of so many observations, to be filled."""
+    """Rows, points_px and rolled_px of that many observations, to be filled."""
     shape = (count, 2)
     return np.empty(count, np.int32), np.empty(shape, np.float32), np.empty(shape, np.float32)
 

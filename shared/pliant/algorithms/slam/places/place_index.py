@@ -60,7 +60,7 @@ _CHUNKS = 3
 _BITS = 16
 
 _COMMON, _COMMON_GROWTH = 8.0, 2.0
-"""A word is passed over that as many places have, and so many times the root of their number."""
+"""A word of this many places, or of this times the root of their number, is skipped."""
 
 _LEAST_DEAD = 64
 """Forgotten places before the index is made anew."""
@@ -103,7 +103,7 @@ def describe(grey: U8) -> Features:
 
 
 def _reduced(grey: U8) -> tuple[U8, F64]:
-    """The image at no more than so many pixels, and its (width, height) as shares of before."""
+    """The image at no more than that many pixels, and its (width, height) as shares of before."""
     height, width = grey.shape
     share = np.sqrt(_MOST_PIXELS / grey.size)
     if share >= 1.0:
