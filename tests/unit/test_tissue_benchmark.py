@@ -57,6 +57,7 @@ def test_a_video_has_a_row_for_each_frame(tmp_path: Path) -> None:
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in said[1].splitlines()[2:]]
     assert [row[0] for row in rows] == ["3", "4"]
     for row in rows:
-        assert float(row[1]) > 90.0
+        assert float(row[1]) > 50.0
         assert float(row[2]) > 90.0
-        assert float(row[3]) == 0.0
+        assert float(row[3]) > 90.0
+        assert float(row[4]) == 0.0
