@@ -102,3 +102,21 @@ def test_samples_of_a_file_come_later(refused: Path, metric: Path) -> None:
     assert "and z is up" in done.stdout
     after, during = (read_tum(folder / "trajectory.txt") for folder in (refused, metric))
     np.testing.assert_allclose(after.T_world_camera, during.T_world_camera, atol=2e-3)
+
+
+def test_more_samples_than_fit_in_the_window_of_the_bus(tmp_path: Path) -> None:
+    """Hours of them, of a sender that waits for its readers: each takes them in its order."""
+    truth = read_tum(builtin_folder("built-in:tiny?frames=12") / "groundtruth.txt")
+    rng, count = np.random.default_rng(0), 10_000
+    many = ImuSamples(
+        stamps_ns=np.linspace(truth.stamps_ns[0], truth.stamps_ns[-1], count).astype(np.int64),
+        gyro_rad_s=0.1 * rng.standard_normal((count, 3)),
+        accel_m_s2=rng.normal((0.0, 0.0, 9.81), 1.0, (count, 3)),
+    )
+    imu = write_imu_csv(tmp_path / "imu.csv", many)
+    done = pliant(
+        "run", "built-in:tiny?frames=12", "--imu", imu, *NO_MESH, "--set", "bus.window=1",
+        "--output", tmp_path / "result",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert read_tum(tmp_path / "result" / "trajectory.txt").stamps_ns.size > 0

@@ -80,15 +80,16 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
 
     def start() -> tuple[Header, FrameMapper, dict[int, _Kept], bool]:
         stream = receive_one(bus, topics.STREAM, CameraStream)
+        # In the order of the sender, which waits for its readers after some messages.  A recording
+        # of an earlier release has no topic of samples.
+        has_samples, later = bus.reads(topics.IMU), stream.sensors_last
+        samples = imu_in(bus.receive(topics.IMU)) if has_samples and not later else None
         known: list[MapKeyframe] = []
         if bus.reads(topics.MAP_KNOWN):
             known += receive(bus, topics.MAP_KNOWN, MapKeyframe)
-        # A recording of an earlier release has no topic of samples.
-        told, later = bus.reads(topics.IMU), stream.sensors_last
-        samples = imu_in(bus.receive(topics.IMU)) if told and not later else None
         parameters, sigma = config.bundle_adjustment, stream.focal_sigma
         mapper = mapper_for(stream.camera, parameters, config.seed, sigma, known, samples)
-        return stream, mapper, {}, told and later
+        return stream, mapper, {}, has_samples and later
 
     # waiting: images and masks of the frames from which a map may yet start, by frame number.
     # later: samples come after the last frame, too late for any.

@@ -153,7 +153,9 @@ class Gyro:
     def lose(self) -> None:
         """The camera's path is interrupted: its turns are unknown."""
         self._times_s, self._turns, self._interval = [], [], None
-        if not self.is_believed:
+        if self.is_believed:  # a few frames would replace what many have shown
+            self._next_s = max(self._next_s, self._seen_s + _FIRST_S)
+        else:
             self._seen_s, self._next_s = 0.0, _FIRST_S
 
     def _seconds(self, stamp_ns: int) -> float:

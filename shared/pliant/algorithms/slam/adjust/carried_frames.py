@@ -21,7 +21,8 @@ _LONGEST_S = 1.0
 _BESIDE = 0.5
 """Of the gap: frames so near tell the velocities at its ends, by parabolas."""
 
-_LEAST_BESIDE = 3
+_LEAST_BESIDE, _NEAR_S = 3, 0.25
+"""This number of frames beside a short gap counts, too, within this number of seconds."""
 
 _POSE_RAD = 2e-3
 """Standard deviation of the poses beside a gap."""
@@ -87,7 +88,8 @@ def _velocity(
     rows = [row]
     while 0 <= rows[-1] + side < len(placed):
         beyond = rows[-1] + side
-        if abs(int(times_ns[beyond] - times_ns[row])) > _BESIDE * gap_ns:
+        limit_ns = _BESIDE * gap_ns if len(rows) >= _LEAST_BESIDE else 1e9 * _NEAR_S
+        if abs(int(times_ns[beyond] - times_ns[row])) > limit_ns:
             break
         rows.append(beyond)
     if len(rows) < _LEAST_BESIDE:
