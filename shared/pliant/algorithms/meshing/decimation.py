@@ -11,11 +11,13 @@ thresholds, not by cost: of a flat square it loses 6 % at 40 triangles, and it s
 what is flat as on what is bent (tests/unit/test_decimation.py fails with it).
 """
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
+from pliant.compiler.kernel import kernel
 
 _AT_ONCE = 0.2
 """Share of the edges, the cheapest ones, that may collapse in a pass."""
@@ -165,8 +167,7 @@ def _cheapest(edges: I64, places: F64, quadrics: F64, most: int) -> tuple[I64, F
     """(C,) edges that collapse together, at most that many, and (C, 3) what they become."""
     u, v = np.divmod(edges, len(places))
     onto, costs = np.empty((len(edges), 3)), np.empty(len(edges))
-    for rows in _parts(len(edges)):
-        onto[rows], costs[rows] = _collapses(u[rows], v[rows], places, quadrics)
+    _collapse(u, v, places, quadrics, onto, costs)
     order = np.argsort(costs, kind="stable")
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))
@@ -178,36 +179,84 @@ def _cheapest(edges: I64, places: F64, quadrics: F64, most: int) -> tuple[I64, F
     return edges[chosen], onto[chosen]
 
 
-def _collapses(u: I64, v: I64, places: F64, quadrics: F64) -> tuple[F64, F64]:
-    """(E, 3) what edges from u to v become, and (E,) what that costs."""
-    both = quadrics[u] + quadrics[v]
-    middle, apart = 0.5 * (places[u] + places[v]), places[u] - places[v]
-    # By the middle, where the quadric determines little: along a plane.
-    A = both[:, :3, :3]
-    stiff = _EVEN * np.trace(A, axis1=1, axis2=2) + 1e-300
-    shift = -(both[:, :3, 3] + np.einsum("nij,nj->ni", A, middle))
-    onto = middle + np.linalg.solve(A + stiff[:, None, None] * np.eye(3), shift[..., None])[..., 0]
-    at = np.column_stack([onto, np.ones(len(onto))])
-    costs = np.einsum("ni,nij,nj->n", at, both, at) + stiff * (apart**2).sum(axis=1)
-    return onto, costs
+@kernel
+def _collapse(u: I64, v: I64, places: F64, quadrics: F64, onto: F64, costs: F64) -> None:
+    """Write (E, 3) what edges from u to v become, and (E,) what that costs.
+
+    Near the middle m where the quadric (A, b, c) determines little, along a plane: with s of EVEN
+    trace(A), (A + s I) d = -(A m + b), both sides over the trace, by Cramer's rule.
+    """
+    x, g = np.empty(4), np.empty(3)
+    q = np.empty((4, 4))
+    for edge in range(len(u)):
+        one, other = u[edge], v[edge]
+        apart = 0.0
+        for i in range(3):
+            apart += (places[one, i] - places[other, i]) ** 2
+            x[i] = 0.5 * (places[one, i] + places[other, i])
+        x[3] = 1.0
+        for i in range(4):
+            for j in range(4):
+                q[i, j] = quadrics[one, i, j] + quadrics[other, i, j]
+        size = q[0, 0] + q[1, 1] + q[2, 2] + 1e-300
+        for i in range(3):
+            g[i] = -(q[i, 0] * x[0] + q[i, 1] * x[1] + q[i, 2] * x[2] + q[i, 3]) / size
+        a, d, f = q[0, 0] / size + _EVEN, q[1, 1] / size + _EVEN, q[2, 2] / size + _EVEN
+        b, c, e = q[0, 1] / size, q[0, 2] / size, q[1, 2] / size
+        ab, ac, bc = d * f - e * e, c * e - b * f, b * e - c * d
+        scale = 1.0 / (a * ab + b * ac + c * bc)
+        x[0] += (ab * g[0] + ac * g[1] + bc * g[2]) * scale
+        x[1] += (ac * g[0] + (a * f - c * c) * g[1] + (b * c - a * e) * g[2]) * scale
+        x[2] += (bc * g[0] + (b * c - a * e) * g[1] + (a * d - b * b) * g[2]) * scale
+        cost = _EVEN * size * apart
+        for i in range(4):
+            for j in range(4):
+                cost += x[i] * q[i, j] * x[j]
+        for i in range(3):
+            onto[edge, i] = x[i]
+        costs[edge] = cost
 
 
 def _unfolded(edges: I64, onto: F64, places: F64, triangles: I64) -> BoolArray:
     """(C,) which of the edges may collapse together so that no triangle turns too far."""
     u, v = np.divmod(edges, len(places))
-    kept, before = np.ones(len(edges), np.bool_), _turned(places, triangles)
+    kept = np.ones(len(edges), np.bool_)
     while True:
         moved, becomes = places.copy(), np.arange(len(places))
         moved[u[kept]] = moved[v[kept]] = onto[kept]
         becomes[v[kept]] = u[kept]
-        after = _turned(moved, triangles)
-        lengths = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
-        a, b, c = becomes[triangles].T
-        stays = (a != b) & (b != c) & (c != a)
-        folds = stays & ((before * after).sum(axis=1) < _FOLD_COSINE * lengths)
         touched = np.zeros(len(places), np.bool_)
-        touched[triangles[folds]] = True
+        _mark_folds(places, moved, becomes, triangles, touched)
         bad = kept & (touched[u] | touched[v])
         if not bad.any():
             return kept
         kept &= ~bad
+
+
+@kernel
+def _mark_folds(places: F64, moved: F64, becomes: I64, triangles: I64, touched: BoolArray) -> None:
+    """Mark the corners of triangles that stay and turn too far between places and moved."""
+    before, after = np.empty(3), np.empty(3)
+    for t in range(len(triangles)):
+        a, b, c = triangles[t]
+        if becomes[a] == becomes[b] or becomes[b] == becomes[c] or becomes[c] == becomes[a]:
+            continue
+        _normal(places, a, b, c, before)
+        _normal(moved, a, b, c, after)
+        product, first, second = 0.0, 0.0, 0.0
+        for k in range(3):
+            product += before[k] * after[k]
+            first += before[k] * before[k]
+            second += after[k] * after[k]
+        if product < _FOLD_COSINE * math.sqrt(first) * math.sqrt(second):
+            touched[a] = touched[b] = touched[c] = True
+
+
+@kernel
+def _normal(places: F64, a: int, b: int, c: int, normal: F64) -> None:
+    """Write the normal of a triangle, as long as twice the area."""
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        normal[k] = (places[b, i] - places[a, i]) * (places[c, j] - places[a, j]) - (
+            places[b, j] - places[a, j]
+        ) * (places[c, i] - places[a, i])
