@@ -117,9 +117,7 @@ def with_depth(source: "SourceSpec", fleet: Sequence[str], config: "Config") -> 
 
 def deformable_fleet(config: "Config") -> str:
     """The profile that makes what surfels are configured to use."""
-    if config.surfels.depth_from == "map":
-        return "deformable-map"
-    return "deformable-tracks" if config.surfels.prediction == "tracks" else "deformable"
+    return "deformable-map" if config.surfels.depth_from == "map" else "deformable"
 
 
 def inputs_of(name: str, fleet: Sequence[str], *, images: bool = True) -> dict[Topic, str]:

@@ -4,8 +4,7 @@ PROFILES: dict[str, tuple[str, ...]] = {
     "rigid": ("ingest", "tracking", "bundle_adjustment", "meshing", "recorder"),
     "points": ("ingest", "tracking", "bundle_adjustment", "recorder"),
     "deformable": ("ingest", "surfels", "recorder"),
-    "deformable-tracks": ("ingest", "tracking", "surfels", "recorder"),
     "deformable-map": ("ingest", "tracking", "bundle_adjustment", "surfels", "recorder"),
 }
-"""``deformable`` becomes one of the others where surfels are configured to use what those make."""
+"""``deformable`` becomes ``deformable-map`` where surfels get their depth from Pliant's own map."""
 NAMES = tuple(dict.fromkeys(name for fleet in PROFILES.values() for name in fleet))

@@ -1,16 +1,12 @@
 """Sequences for the tables of surfels: images, depth maps and truth, loaded once."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.tracking.parameters import TrackingParameters
-from pliant.algorithms.tracking.tracker import ExtremaTracker
-from pliant.algorithms.tracks import FrameTracks
 from pliant.datasets import open_source
 from pliant.datasets.base import BrokenFrame, is_builtin
 from pliant.datasets.builtin import builtin_folder, is_deforming
@@ -30,15 +26,6 @@ class Sequence:
     stamps_ns: list[int]
     depths: list[F64]
     truth: SurfaceTruth | None
-
-    @cached_property
-    def tracks(self) -> list[FrameTracks]:
-        """What the tracking service would make of the images."""
-        tracker = ExtremaTracker(self.camera.width, self.camera.height, TrackingParameters(), 0)
-        return [
-            tracker.track(image, stamp_ns)
-            for image, stamp_ns in zip(self.images, self.stamps_ns, strict=True)
-        ]
 
     def interval_s(self, number: int) -> float:
         """From the frame before to this one."""

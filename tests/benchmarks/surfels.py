@@ -13,7 +13,6 @@ from benchmarks.surfel_losses import measure_losses
 from benchmarks.surfel_sequences import Sequence, load
 from benchmarks.table import markdown
 from pliant.algorithms.surfels.parameters import SurfelParameters
-from pliant.algorithms.surfels.prediction import predict
 from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
 from pliant.datasets.builtin import is_deforming
 from pliant.errors import DatasetError
@@ -50,7 +49,6 @@ TABLES = (
     "scales",
     "cameras",
     "neighbours",
-    "predictions",
     "troubles",
     "light",
     LIMITS,
@@ -134,9 +132,6 @@ def _rows(table: str, sources: list[str], tracks: str | None) -> list[_Row]:
         return _each(moving, {name: {"camera": mode} for name, mode in _CAMERAS.items()})
     if table == "neighbours":
         return _each(still, {f"{count} neighbours": {"neighbours": count} for count in (0, 8)})
-    if table == "predictions":
-        jumping = sources or [*few, *(_with(s, f"drop={n}") for s in few for n in (8, 12))]
-        return _each(jumping, {name: {"prediction": name} for name in ("none", "tracks")})
     if table == "light":
         lit = [_with(source, "lamp=camera") for source in (sources or [*rendered, *one_moving])]
         elsewhere = [] if sources else ["built-in:objects", *one_moving]
@@ -194,18 +189,13 @@ def _measure(sequence: Sequence, parameters: SurfelParameters) -> list[str]:
     exact = ExactSurfels(sequence.truth) if sequence.truth is not None else None
     by_depth = SurfelTruth(sequence.camera)
     spent: list[float] = []
-    seen = np.zeros((0, 2), np.float32)
     for number, image in enumerate(sequence.images):
-        led = parameters.prediction == "tracks" and number > 0
-        before, now = (sequence.tracks[k] for k in (number - 1, number)) if led else (None, None)
         start = time.perf_counter()
         if number == 0:
             surfels = tracker.start(image, sequence.depths[0], sequence.camera)
         else:
-            prediction = predict(seen, before, now) if before and now else None
-            surfels = tracker.track(image, sequence.interval_s(number), prediction)
+            surfels = tracker.track(image, sequence.interval_s(number))
         spent.append(time.perf_counter() - start)
-        seen = surfels.points_px
         if exact is not None:
             exact.add(number, surfels)
         elif sequence.depths[number].size:

@@ -315,14 +315,13 @@ def test_tracks_predict_the_motion_of_surfels(
     rest = without_depth(everything)[topics.DEPTH][1:4]
     leaping[topics.DEPTH] = [everything[topics.DEPTH][0], *rest]  # nothing is born later
     common = ["surfels.max_surfels=60", "surfels.levels=1", "surfels.neighbours=0"]
-    told = [*common, "surfels.prediction=tracks"]
     alone = follow(load_config(None, common), leaping)
-    led = follow(load_config(None, told), leaping, topics.EXTREMA)
+    led = follow(load_config(None, common), leaping, topics.EXTREMA)
     assert np.count_nonzero(alone[1].state == SurfelState.TRACKED) < 0.3 * len(alone[1].ids)
     assert np.count_nonzero(led[-1].state == SurfelState.TRACKED) > 0.8 * len(led[-1].ids)
 
 
-@pytest.mark.parametrize("setting", ["surfels.depth_from=map", "surfels.prediction=tracks"])
-def test_a_topic_without_a_publisher_fails_at_once(everything: Messages, setting: str) -> None:
+def test_a_topic_without_a_publisher_fails_at_once(everything: Messages) -> None:
+    setting = "surfels.depth_from=map"
     with pytest.raises(ConfigError, match=f"{setting}: no service of this session publishes"):
         follow(load_config(None, [setting]), everything)

@@ -105,7 +105,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
         if not missing and state.started:
             with monitor.stage("track"):
                 interval_s = 1e-9 * (image.stamp_ns - state.stamp_ns)
-                prediction = _prediction(state, heard, config)
+                prediction = _prediction(state, heard)
                 frame = state.tracker.track(image.grey, interval_s, prediction, metres)
             if view is not None:
                 with monitor.stage("births"):
@@ -129,15 +129,11 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
 
 def _check(bus: Bus, config: Config) -> None:
     """Raise ConfigError if the configuration needs a topic that no service publishes."""
-    needs = {
-        "surfels.depth_from=map": (config.surfels.depth_from == "map", topics.KEYFRAME),
-        "surfels.prediction=tracks": (config.surfels.prediction == "tracks", topics.EXTREMA),
-    }
-    for setting, (wanted, topic) in needs.items():
-        if wanted and not bus.reads(topic):
-            raise ConfigError(
-                f"{setting}: no service of this session publishes {topic.key}, which it needs"
-            )
+    if config.surfels.depth_from == "map" and not bus.reads(topics.KEYFRAME):
+        raise ConfigError(
+            "surfels.depth_from=map: no service of this session publishes "
+            f"{topics.KEYFRAME.key}, which it needs"
+        )
 
 
 def _hear(bus: Bus) -> Iterator[_Heard]:
@@ -160,8 +156,8 @@ def _unmasked(image: Image) -> Image:
     return image if image.missing else replace(image, grey=glaring(image.grey, clearance(image)))
 
 
-def _prediction(state: _State, heard: _Heard, config: Config) -> F64 | None:
-    if config.surfels.prediction == "none" or state.tracks is None or heard.tracks is None:
+def _prediction(state: _State, heard: _Heard) -> F64 | None:
+    if state.tracks is None or heard.tracks is None:
         return None
     return predict(state.points_px, state.tracks, heard.tracks)
 

@@ -88,14 +88,6 @@ class SurfelParameters(Parameters):
             "observed for a short time."
         ),
     )
-    prediction: Literal["auto", "none", "tracks"] = Field(
-        default="auto",
-        description=(
-            "tracks: predict each surfel by the extrema around it, otherwise by the dominant "
-            "flow (not in the paper; needs the tracking service).  auto: tracks if the "
-            "tracking service runs anyway."
-        ),
-    )
 
     max_surfels: int = Field(default=500, ge=1, le=20_000, description="Maximum number of surfels.")
     patch_px: int = Field(
