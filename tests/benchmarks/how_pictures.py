@@ -12,7 +12,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.meshing.delaunay import triangulate
 from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints
-from pliant.algorithms.meshing.parameters import SurfaceParameters
+from pliant.algorithms.meshing.parameters import NltgvParameters, SurfaceParameters
 from pliant.algorithms.meshing.rendering import normals_of
 from pliant.algorithms.tracking.maxima import curvature_and_maxima
 from pliant.algorithms.tracking.tracker import ExtremaTracker
@@ -31,6 +31,8 @@ _QUALITY = 82
 _ENLARGED = 5
 _GAP = 8
 _FIXED_POINT = 4
+_ROUGH = NltgvParameters(data_weight=1e6, data_sigmas=0.0, reweightings=1)
+"""Keeps the data as they are."""
 _ORANGE, _BLUE, _WHITE = (255, 150, 40), (90, 170, 255), (255, 255, 255)
 
 
@@ -61,9 +63,7 @@ def draw(rigid: Path, deforming: Path, folder: Path) -> Iterator[str]:
 def _extrema(grey: U8) -> U8:
     """A part of the image, and its curvature; the extrema on both."""
     p = load_config().tracking
-    _, kappa, _, maxima = curvature_and_maxima(
-        grey, p.blur_sigma_px, p.min_curvature, both_signs=p.both_signs
-    )
+    _, kappa, _, maxima = curvature_and_maxima(grey, p.blur_sigma_px, p.min_curvature)
     height, width = (side // _ENLARGED for side in grey.shape)
     top, left = 2 * height, 2 * width
     here = maxima[:, :2] - (left, top)
@@ -111,8 +111,8 @@ def _depth(room: Result, keyframe: Keyframe) -> U8:
         keyframes=np.asarray(points.keyframes, np.int32),
     )
     rough, smoothed = (
-        _depths_of(room.camera, SurfaceParameters(smoothing=kind), keyframe, seen)
-        for kind in ("none", "nltgv")
+        _depths_of(room.camera, SurfaceParameters(nltgv=nltgv), keyframe, seen)
+        for nltgv in (_ROUGH, SurfaceParameters().nltgv)
     )
     mesh = triangulate(seen.points_px)
     image = keyframe.image

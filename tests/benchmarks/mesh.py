@@ -35,15 +35,10 @@ from pliant_services.mesh.command import Meshing, mesh_recording
 from pliant_services.nodes.meshing import warm_up
 
 _SMOOTHING = {
-    "NLTGV": "nltgv",
-    "Laplacian smoothing": "laplacian",
-    "no smoothing": "none",
+    "NLTGV": (),
+    "no smoothing": ("data_weight=1e6", "data_sigmas=0", "reweightings=1"),
 }
-_LIVE = {
-    "keyframes stay where they were put": ("corrections=settled", "live_depth=points"),
-    "keyframes follow the map": ("corrections=moved", "live_depth=points"),
-    "and dense depth": ("corrections=moved", "live_depth=dense"),
-}
+_LIVE = {"keyframes follow the map": "points", "and dense depth": "dense"}
 _FIGURES = (
     "covered", "median error", "within 5 %", "with the scale that fits", "normals",
     "F-score (precision, recall)", "triangles",
@@ -57,11 +52,11 @@ def measure(result: Path, groundtruth: str, overrides: Sequence[str]) -> Iterato
     """A table of meshes of one result folder."""
     compared = _Compared(result, groundtruth)
     rows: list[list[str]] = []
-    for name, kind in _SMOOTHING.items():
-        found = compared.make([*overrides, f"meshing.surface.smoothing={kind}"])
+    for name, settings in _SMOOTHING.items():
+        found = compared.make([*overrides, *(f"meshing.surface.nltgv.{s}" for s in settings)])
         for level in ("fine", "coarse"):
             pieces = meshes_of(found.pieces).get((compared.segment, level))
-            if pieces is None or (level == "coarse" and kind != "nltgv"):
+            if pieces is None or (level == "coarse" and settings):
                 continue
             rows.append([f"{name}, {level} TSDF", *compared.figures(joined(pieces))])
     figures = compared.figures(poisson(compared.history))
@@ -70,12 +65,12 @@ def measure(result: Path, groundtruth: str, overrides: Sequence[str]) -> Iterato
 
 
 def measure_live(result: Path, groundtruth: str, overrides: Sequence[str]) -> Iterator[str]:
-    """A table of the live mesh with and without following the map, and of the final one."""
+    """A table of the live mesh, of landmarks and of dense depth, and of the final one."""
     compared = _Compared(result, groundtruth)
     warm_up()
     rows: list[list[str]] = []
-    for name, ways in _LIVE.items():
-        settings = [*overrides, *(f"meshing.{way}" for way in ways)]
+    for name, depth in _LIVE.items():
+        settings = [*overrides, f"meshing.live_depth={depth}"]
         for when, mesh, voxel, *costs in compared.live(settings):
             figures = [*compared.near(mesh, voxel), *compared.figures(mesh)[:-1]]
             rows.append([f"{name}, {when}", *costs, *figures])

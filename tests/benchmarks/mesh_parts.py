@@ -11,7 +11,7 @@ from benchmarks.table import markdown
 from pliant.algorithms.arrays import F32, F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.meshing.delaunay import triangulate
-from pliant.algorithms.meshing.keyframe_surface import filter_triangles, laplacian
+from pliant.algorithms.meshing.keyframe_surface import filter_triangles
 from pliant.algorithms.meshing.mesh_blocks import BlockMesh
 from pliant.algorithms.meshing.nltgv import NltgvResult, smooth
 from pliant.algorithms.meshing.parameters import (
@@ -98,7 +98,6 @@ def _gains(vertices: int, seeds: int) -> Iterator[str]:
     """Errors of inverse depth with 10 % outliers, medians over scenes."""
     kinds: dict[str, Callable[[Scene], F32]] = {
         "none": lambda scene: scene.data,
-        "Laplacian": lambda scene: laplacian(scene.data, scene.mesh.edges),
         "NLTGV": lambda scene: _smooth(scene).inverse_depths,
     }
     scenes = [make_scene(vertices, seed) for seed in range(seeds)]

@@ -116,10 +116,6 @@ class Table:
 
 _BENCH = "scripts/bench"
 _PATHS = "tsukuba150 7scenes_redkitchen400 tsdfold_50 kitti_nn_seq1 tum_fr1_xyz tartanair_189"
-_ABLATION = (
-    "tsukuba150 tsdfold_50 kitti_nn_seq1 'built-in:room?frames=120' tartanair_189 "
-    "7scenes_redkitchen400 tum_fr1_xyz kitti_00_small1018"
-)
 _LIGHT = f"in-process {_PATHS} kitti_00_small1018 built-in:room built-in:corridor"
 _MESHED = {
     "built-in:room": "room",
@@ -234,6 +230,5 @@ TABLES: dict[str, Table] = {
         ),
     ),
     "mesh-parts": Table(1, (f"{_BENCH} mesh-parts",)),
-    "ablation": Table(60, (f"{_BENCH} ablation {_ABLATION}",)),
 }
 """By name, in the order of the page."""

@@ -39,7 +39,7 @@ def test_grid_finds_two_motions(shift: tuple[float, float]) -> None:
     before = scene(np.zeros((HEIGHT, WIDTH)), np.zeros((HEIGHT, WIDTH)))
     after = scene(shift[0] + extra, shift[1] + 0.0 * extra)
     _, kappa = curvature(before, 1.0)
-    _, maxima = find_maxima(kappa, 0.5, both_signs=True)
+    _, maxima = find_maxima(kappa, 0.5)
     hint = np.zeros((*grid_shape(WIDTH, HEIGHT), 2), np.float32)
     flow = local_flow(levels(before), levels(after), maxima, IDENTITY, hint).grid
     columns = (np.arange(flow.shape[1]) + 0.5) * CELL_PX

@@ -95,7 +95,7 @@ def test_nothing_is_found_where_an_image_is_filled(mask: Callable[[int], BoolArr
     np.testing.assert_array_equal(outcome[0][kept], image[kept])
     found = []
     for each in (outcome[0], np.where(mask(2), image, noise(1))):
-        maxima = curvature_and_maxima(each, 1.2, 8.0, both_signs=True)[3]
+        maxima = curvature_and_maxima(each, 1.2, 8.0)[3]
         u, v = np.rint(maxima[:, :2]).astype(np.int64).T
         found.append(np.count_nonzero(clearance_of(~kept)[v, u] > 8))
     assert found[0] == 0

@@ -41,7 +41,7 @@ def mesh(
 
     pliant mesh results/room --set meshing.tsdf.fine_voxel=0.005
 
-    pliant mesh results/room --set meshing.surface.smoothing=none --output results/raw
+    pliant mesh results/room --set meshing.depth=points --output results/points
 
     pliant mesh results/room --watertight --clean
     """

@@ -195,7 +195,7 @@ class Mesher:
     def _follow_map(self, timer: StageTimer) -> None:
         """Fuse a keyframe that the live mesh lacks, or has elsewhere than the map has it by now:
         one at a time, so that no message waits for all."""
-        if self._has_moved and self._live is not None and self._parameters.corrections == "moved":
+        if self._has_moved and self._live is not None:
             lacking = [keyframe for keyframe in self._again if keyframe not in self._live.fused]
             self._again = [*lacking, *self._live.moved(self._map)]
         self._has_moved = False

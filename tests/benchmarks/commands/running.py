@@ -41,7 +41,7 @@ def in_process(
 ) -> None:
     """The rigid pipeline in one process, without services: final and online ATE.
 
-    scripts/bench in-process path/to/tsukuba150 built-in:room --set tracking.turn_patches=false
+    scripts/bench in-process path/to/tsukuba150 built-in:room --set tracking.coast_s=0
     """
     from benchmarks.in_process import measure
 
@@ -218,24 +218,6 @@ def slow_mapping(
     from benchmarks.slow_mapping import measure
 
     show(measure(source, frames, fps, slowdown, overrides or []))
-
-
-@app.command()
-def ablation(
-    sources: Sources,
-    *,
-    only: Annotated[
-        list[str] | None, typer.Option(help="This switch, beside everything on; can be repeated.")
-    ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Runs of each.")] = 1,
-) -> None:
-    """What each addition to the paper is worth: final / online ATE.
-
-    scripts/bench ablation built-in:room path/to/sequence
-    """
-    from benchmarks.ablation import measure
-
-    show(measure(sources, only=only or [], seeds=seeds))
 
 
 @app.command()

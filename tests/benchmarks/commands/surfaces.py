@@ -16,7 +16,7 @@ def mesh(
     ],
     overrides: Overrides = None,
 ) -> None:
-    """Meshes of one run: NLTGV, Laplacian, no smoothing, Poisson, against true depth.
+    """Meshes of one run: NLTGV, no smoothing, Poisson, against true depth.
 
     scripts/bench mesh results/room --groundtruth built-in:room
     """
@@ -33,7 +33,7 @@ def mesh_live(
     ],
     overrides: Overrides = None,
 ) -> None:
-    """The live mesh with and without following the corrections of the map, against true depth.
+    """The live mesh, of landmarks and of dense depth, and the final one, against true depth.
 
     scripts/bench mesh-live results/court --groundtruth built-in:court
     """

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -21,8 +20,6 @@ _MIN_SHARED = 0.3
 """Share of the vertices that must live on for the last surface to be worth starting from."""
 _MAX_DIFFERENCE = 0.2
 """Share of the inverse depth by which the last surface may differ from a point that it meets."""
-_LAPLACIAN_ROUNDS = 10
-_LAPLACIAN_STEP = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,11 +138,6 @@ class KeyframeSurfaces:
     def _smooth(
         self, T: F64, ids: I64, pixels: F32, data: F32, sigmas: F32, mesh: Triangulation
     ) -> tuple[F32, int]:
-        kind = self._parameters.smoothing
-        if kind == "none":
-            return data, 0
-        if kind == "laplacian":
-            return laplacian(data, mesh.edges), 0
         begin = self._start(T, ids, pixels, data, mesh.edges)
         result = smooth(pixels, data, sigmas, mesh.edges, self._parameters.nltgv, begin)
         self._keep(ids, T, pixels, result, mesh.edges)
@@ -251,18 +243,3 @@ def _kept(
         norms = math.sqrt((n0 * n0 + n1 * n1 + n2 * n2) * (m0 * m0 + m1 * m1 + m2 * m2))
         kept[t] = norms > 0.0 and dot >= min_cosine * norms
     return kept
-
-
-def laplacian(inverse_depths: F32, edges: I32) -> F32:
-    """(M,) inverse depths after ten rounds, each half way to the mean of the neighbours.
-
-    With it NLTGV is compared: it rounds steps and creases off.
-    """
-    count = np.bincount(edges.ravel(), minlength=len(inverse_depths))
-    values: Any = inverse_depths.astype(np.float64)
-    for _ in range(_LAPLACIAN_ROUNDS):
-        total = np.bincount(edges[:, 0], values[edges[:, 1]], len(values))
-        total += np.bincount(edges[:, 1], values[edges[:, 0]], len(values))
-        mean = np.where(count > 0, total / np.maximum(count, 1), values)
-        values = values + _LAPLACIAN_STEP * (mean - values)
-    return values.astype(np.float32)

@@ -95,12 +95,6 @@ class TriangleFilterParameters(Parameters):
 class SurfaceParameters(Parameters):
     """How the points of a keyframe become a surface."""
 
-    smoothing: Literal["nltgv", "laplacian", "none"] = Field(
-        default="nltgv",
-        description=(
-            "Smoothing of the inverse depth; methods other than the default are for comparison."
-        ),
-    )
     max_error_px: float = Field(
         default=2.0,
         gt=0.0,
@@ -178,13 +172,6 @@ class MeshingParameters(Parameters):
         default=64,
         ge=0,
         description="Unchanged blocks repeated with each change, in turn, for late viewers.",
-    )
-    corrections: Literal["settled", "moved"] = Field(
-        default="moved",
-        description=(
-            "When a keyframe in the live mesh is fused again: when it leaves the window, or "
-            "also when the whole map has moved it by a voxel (settled is for comparison)."
-        ),
     )
     depth: Literal["dense", "points"] = Field(
         default="dense",

@@ -82,7 +82,6 @@ class LocalisationParameters(Parameters):
 class ReacquisitionParameters(Parameters):
     """How landmarks that lost their track are reacquired at the maxima of a frame."""
 
-    enabled: bool = Field(default=True, description="Search for lost landmarks in every frame")
     radius_px: float = Field(
         default=2.5,
         gt=0.0,
@@ -243,9 +242,6 @@ class WindowParameters(Parameters):
         default=2.5,
         gt=0.0,
         description="Observations with a larger reprojection error are removed, px",
-    )
-    final_adjustment: bool = Field(
-        default=True, description="Adjust all keyframes of a segment when the stream ends"
     )
     final_iterations: int = Field(
         default=30, ge=1, description="Maximum Schur LM iterations when the stream ends"

@@ -49,7 +49,7 @@ class FrameImages(NamedTuple):
 
 
 class StepLimits(NamedTuple):
-    """Limits and switches of a step: see the fields of TrackingParameters.
+    """Limits of a step: see the fields of TrackingParameters.
 
     interval_s: from the frame before to this one.
     """
@@ -63,8 +63,6 @@ class StepLimits(NamedTuple):
     extremum_gate: np.float32
     coast_gate: np.float32
     backward_gate: np.float32
-    subpixel: bool
-    patch_refinement: bool
     patch_iterations: int
     coast_s: np.float32
     interval_s: np.float32
@@ -111,25 +109,19 @@ def advance_tracks(
         du, dv = motions[rank, 0], motions[rank, 1]
         before_u, before_v = track.u, track.v
         pixel = _find_extremum(kappa, du, dv, limits, track)
-        if limits.patch_refinement:
-            fine = track.octave == 0
-            alive = _follow_patch(
-                before.full if fine else before.half,
-                now.full if fine else now.half,
-                kappa,
-                pixel,
-                du,
-                dv,
-                limits,
-                track,
-                templates,
-                scratch,
-            )
-        else:
-            alive = pixel >= 0
-            if alive:
-                _settle(kappa, pixel, limits.subpixel, track)
-                track.u, track.v = track.extremum_u, track.extremum_v
+        fine = track.octave == 0
+        alive = _follow_patch(
+            before.full if fine else before.half,
+            now.full if fine else now.half,
+            kappa,
+            pixel,
+            du,
+            dv,
+            limits,
+            track,
+            templates,
+            scratch,
+        )
         track.motion_u, track.motion_v = track.u - before_u, track.v - before_v
         track.alive = 1 if alive else 0
 
@@ -211,21 +203,19 @@ def patch_inside(image: Pixels, left: int, top: int) -> bool:
 
 
 @fast_kernel
-def _extremum_position(kappa: Pixels, pixel: int, subpixel: bool) -> tuple[np.float32, np.float32]:
-    """Position of an extremum: of its pixel, or of the parabola around it."""
+def _extremum_position(kappa: Pixels, pixel: int) -> tuple[np.float32, np.float32]:
+    """Position of an extremum: of the parabola around it."""
     k, width = kappa.values, kappa.width
     x, y = pixel % width, pixel // width
-    u, v = np.float32(x), np.float32(y)
-    if subpixel:
-        u += subpixel_offset(k[pixel - 1], k[pixel], k[pixel + 1])
-        v += subpixel_offset(k[pixel - width], k[pixel], k[pixel + width])
+    u = np.float32(x) + subpixel_offset(k[pixel - 1], k[pixel], k[pixel + 1])
+    v = np.float32(y) + subpixel_offset(k[pixel - width], k[pixel], k[pixel + width])
     return u, v
 
 
 @fast_kernel
-def _settle(kappa: Pixels, pixel: int, subpixel: bool, track: Track) -> None:
+def _settle(kappa: Pixels, pixel: int, track: Track) -> None:
     """Put a track on an extremum of this frame."""
-    u, v = _extremum_position(kappa, pixel, subpixel)
+    u, v = _extremum_position(kappa, pixel)
     track.extremum_u, track.extremum_v = u, v
     track.kappa = kappa.values[pixel]
     track.pixel = pixel
@@ -273,7 +263,7 @@ def _follow_patch(
     place = _Place(u, v, False)
     on_extremum = False
     if pixel >= 0:
-        start_u, start_v = _extremum_position(kappa, pixel, limits.subpixel)
+        start_u, start_v = _extremum_position(kappa, pixel)
         if track.pixel >= 0:
             start_u, start_v = u + (start_u - track.extremum_u), v + (start_v - track.extremum_v)
         place = _align_track(
@@ -293,7 +283,7 @@ def _follow_patch(
             return False
     track.u, track.v = place.u, place.v
     if on_extremum:
-        _settle(kappa, pixel, limits.subpixel, track)
+        _settle(kappa, pixel, track)
     else:
         track.pixel = -1
         track.state = COASTING

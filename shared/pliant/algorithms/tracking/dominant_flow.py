@@ -56,7 +56,7 @@ class BriefExtractor:
         small = shrink(grey, factor)
         if min(small.shape) <= 2 * BRIEF_RADIUS + 1:
             return _no_features()
-        smooth, _, _, maxima = curvature_and_maxima(small, 1.0, 0.1, both_signs=True)
+        smooth, _, _, maxima = curvature_and_maxima(small, 1.0, 0.1)
         u, v, strength = maxima[:, 0], maxima[:, 1], np.abs(maxima[:, 2])
         height, width = small.shape
         limit_u, limit_v = width - 1 - BRIEF_RADIUS, height - 1 - BRIEF_RADIUS

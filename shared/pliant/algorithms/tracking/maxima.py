@@ -49,7 +49,6 @@ def curvature_and_maxima(
     sigma_px: float,
     min_curvature: float,
     *,
-    both_signs: bool,
     smooth: F32 | None = None,
     kappa: F32 | None = None,
 ) -> tuple[F32, F32, I32, F32]:
@@ -60,14 +59,14 @@ def curvature_and_maxima(
     height, width = image.shape
     if width < _LEAST_WIDTH:
         smooth, kappa = curvature(image, sigma_px, smooth, kappa)
-        return smooth, kappa, *find_maxima(kappa, min_curvature, both_signs=both_signs)
+        return smooth, kappa, *find_maxima(kappa, min_curvature)
     smooth = np.empty((height, width), np.float32) if smooth is None else smooth
     kappa = np.empty((height, width), np.float32) if kappa is None else kappa
     scratch = row_scratch(width)
     pixels, maxima = _room_for_all(height, width)
-    lowest, highest = _limits(min_curvature, both_signs=both_signs)
+    limit = np.float32(min_curvature)
     count = _curvature_and_maxima(
-        image, gaussian_taps(sigma_px), lowest, highest, scratch, smooth, kappa, pixels, maxima
+        image, gaussian_taps(sigma_px), -limit, limit, scratch, smooth, kappa, pixels, maxima
     )
     return smooth, kappa, pixels[:count].copy(), maxima[:count].copy()
 
@@ -79,7 +78,7 @@ def maxima_of(image: U8, parameters: TrackingParameters, clearance: F32 | None =
     ``image.masks``; None: without one.
     """
     _, _, pixels, maxima = curvature_and_maxima(
-        image, parameters.blur_sigma_px, parameters.min_curvature, both_signs=parameters.both_signs
+        image, parameters.blur_sigma_px, parameters.min_curvature
     )
     return uncovered(pixels, maxima, clearance)[1]
 
@@ -94,20 +93,21 @@ def uncovered(pixels: I32, maxima: F32, clearance: F32 | None) -> tuple[I32, F32
     return pixels[kept], maxima[kept]
 
 
-def find_maxima(kappa: F32, min_curvature: float, *, both_signs: bool) -> tuple[I32, F32]:
-    """Find the pixels whose curvature exceeds that of all eight neighbours and a threshold.
+def find_maxima(kappa: F32, min_curvature: float) -> tuple[I32, F32]:
+    """Find the pixels whose curvature exceeds that of all eight neighbours and a threshold, or is
+    below all and minus the threshold: dark features and bright ones.
 
-    kappa: (H, W) from ``curvature``.  min_curvature: DN^3, >= 0.  both_signs: minima below
-    -min_curvature count too.  Among equal neighbours the last in scan order wins, so that a
-    plateau has at most one.  Returns (M,) flat pixel indices in scan order, and (M, 3) rows
-    (u, v, kappa) with the sub-pixel position of a separable parabola, within 0.5 px of the pixel.
+    kappa: (H, W) from ``curvature``.  min_curvature: DN^3, >= 0.  Among equal neighbours the last
+    in scan order wins, so that a plateau has at most one.  Returns (M,) flat pixel indices in scan
+    order, and (M, 3) rows (u, v, kappa) with the sub-pixel position of a separable parabola, within
+    0.5 px of the pixel.
     """
     height, width = kappa.shape
     if width < _LEAST_WIDTH:
         kappa = np.pad(kappa, ((0, 0), (0, _LEAST_WIDTH - width)))
     pixels, maxima = _room_for_all(height, width)
-    lowest, highest = _limits(min_curvature, both_signs=both_signs)
-    count = _find_maxima(kappa, width, lowest, highest, pixels, maxima)
+    limit = np.float32(min_curvature)
+    count = _find_maxima(kappa, width, -limit, limit, pixels, maxima)
     return pixels[:count].copy(), maxima[:count].copy()
 
 
@@ -115,11 +115,6 @@ def _room_for_all(height: int, width: int) -> tuple[I32, F32]:
     """Of four pixels in a square one is a maximum at most, and one a minimum."""
     most = height * width // 2 + RUN
     return np.empty(most, np.int32), np.empty((most, 3), np.float32)
-
-
-def _limits(min_curvature: float, *, both_signs: bool) -> tuple[np.float32, np.float32]:
-    """What minima must be less than, and maxima more than."""
-    return np.float32(-min_curvature if both_signs else -np.inf), np.float32(min_curvature)
 
 
 @fast_kernel

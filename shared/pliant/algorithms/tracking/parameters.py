@@ -1,4 +1,4 @@
-"""Parameters of the extrema tracker; every switch off gives VITAMIN-E, section 2, literally."""
+"""Parameters of the extrema tracker (VITAMIN-E, section 2, and what was added to it)."""
 
 from pydantic import Field
 
@@ -13,10 +13,6 @@ class TrackingParameters(Parameters):
     )
     min_curvature: float = Field(
         default=0.5, ge=0.0, description="Minimum |kappa| of an extremum, DN^3."
-    )
-    both_signs: bool = Field(
-        default=True,
-        description="Track minima of kappa (bright features) as well as maxima (dark ones).",
     )
     max_tracks: int = Field(
         default=10_000, ge=100, le=100_000, description="Maximum tracks in a frame."
@@ -53,24 +49,6 @@ class TrackingParameters(Parameters):
         description="Maximum distance between an extremum and its prediction, px.",
     )
 
-    local_flow: bool = Field(
-        default=True,
-        description="Predict with a coarse-to-fine local flow grid, not one affine motion.",
-    )
-    subpixel: bool = Field(
-        default=True, description="Locate extrema by a parabola, not on whole pixels."
-    )
-    patch_refinement: bool = Field(
-        default=True,
-        description=(
-            "Refine by a small patch, which also carries a track through frames without an "
-            "extremum."
-        ),
-    )
-    turn_patches: bool = Field(
-        default=True,
-        description="Rotate and scale patches with their surface.",
-    )
     patch_iterations: int = Field(
         default=4, ge=1, le=20, description="Maximum Gauss-Newton steps of a patch in a frame."
     )

@@ -94,7 +94,6 @@ class ExtremaTracker:
                 grey,
                 p.blur_sigma_px,
                 p.min_curvature,
-                both_signs=p.both_signs,
                 smooth=self._spare_smooth,
                 kappa=self._kappa,
             )
@@ -134,14 +133,14 @@ class ExtremaTracker:
         return fit_affine(sources, targets, sigma_px=self._parameters.flow_sigma_px)
 
     def _local_flow(self, pyramid: list[F32], affine: F32) -> Flow:
-        if not (self._parameters.local_flow and self._has_previous):
+        if not self._has_previous:
             return Flow(np.zeros_like(self._local), affine)
         return local_flow(self._pyramid, pyramid, self._maxima, affine, self._local)
 
     def _advance(
         self, now: FrameImages, flow: Flow, interval_s: float, clearance: F32 | None
     ) -> None:
-        table, p = self._table, self._parameters
+        table = self._table
         before = FrameImages(pixels_of(self._smooth), pixels_of(self._pyramid[0]))
         tracks_before = table.tracks.copy()
         advance_tracks(
@@ -149,7 +148,7 @@ class ExtremaTracker:
             now,
             pixels_of(self._kappa),
             flow,
-            _step_limits(p, interval_s),
+            _step_limits(self._parameters, interval_s),
             scan_order(table.tracks, self._shape[0]),
             self._motions,
             table.tracks,
@@ -164,10 +163,9 @@ class ExtremaTracker:
             self._kept = self._last_sharp(tracks_before)
         self._lost_at_once = at_once
         self._compact()
-        if p.patch_refinement and p.turn_patches:
-            slopes = slopes_of_motion(table.tracks, flow.affine, *self._shape)
-            window = pixels_of(self._window)
-            turn_templates(table.tracks, slopes, flow.affine, table.patches, window, self._rows)
+        slopes = slopes_of_motion(table.tracks, flow.affine, *self._shape)
+        window = pixels_of(self._window)
+        turn_templates(table.tracks, slopes, flow.affine, table.patches, window, self._rows)
 
     def _start_tracks(
         self, now: FrameImages, pixels: I32, maxima: F32, clearance: F32 | None
@@ -192,7 +190,7 @@ class ExtremaTracker:
             self._compact()
 
     def _last_sharp(self, tracks: Tracks) -> LastSharp | None:
-        if self._features is None or not self._parameters.patch_refinement:
+        if self._features is None:
             return None
         return LastSharp(
             stamp_ns=self._stamp_ns,
@@ -218,7 +216,10 @@ class ExtremaTracker:
         lost = kept.lost(table)
         if not is_over(kept, lost, stamp_ns, p.coast_s):
             affine = self._flow_between(kept.features, features)
-            flow = self._flow_from(kept, pyramid, affine.astype(np.float32).ravel())
+            flow = local_flow(
+                kept.pyramid, pyramid, kept.maxima, affine.astype(np.float32).ravel(),
+                np.zeros_like(kept.local),
+            )  # fmt: skip
             advance_tracks(
                 FrameImages(pixels_of(kept.smooth), pixels_of(kept.pyramid[0])),
                 now,
@@ -237,11 +238,6 @@ class ExtremaTracker:
         if is_over(kept, lost, stamp_ns, p.coast_s):
             release(table, kept)
             self._kept = None
-
-    def _flow_from(self, kept: LastSharp, pyramid: list[F32], affine: F32) -> Flow:
-        if not self._parameters.local_flow:
-            return Flow(np.zeros_like(kept.local), affine)
-        return local_flow(kept.pyramid, pyramid, kept.maxima, affine, np.zeros_like(kept.local))
 
     def _compact(self) -> None:
         table = self._table
@@ -293,8 +289,6 @@ def _step_limits(p: TrackingParameters, interval_s: float) -> StepLimits:
         extremum_gate=np.float32(p.extremum_gate_px),
         coast_gate=np.float32(p.coast_gate_px),
         backward_gate=np.float32(p.backward_gate_px),
-        subpixel=p.subpixel,
-        patch_refinement=p.patch_refinement,
         patch_iterations=p.patch_iterations,
         coast_s=np.float32(p.coast_s),
         interval_s=np.float32(interval_s),
@@ -308,6 +302,4 @@ def _birth_limits(p: TrackingParameters) -> BirthLimits:
         min_strength=np.float32(p.min_strength),
         fine_strength=np.float32(p.fine_strength),
         min_isotropy=np.float32(p.min_isotropy),
-        subpixel=p.subpixel,
-        patch_refinement=p.patch_refinement,
     )

@@ -31,8 +31,6 @@ class BirthLimits(NamedTuple):
     min_strength: np.float32
     fine_strength: np.float32
     min_isotropy: np.float32
-    subpixel: bool
-    patch_refinement: bool
 
 
 class _Birth(NamedTuple):
@@ -100,16 +98,12 @@ def start_tracks(
             x, y = at % width, at // width
             if turn == 0 and load[y // cell, x // cell] >= share:
                 continue
-            u, v = np.float32(x), np.float32(y)
-            if limits.subpixel:
-                u, v = maxima[i, 0], maxima[i, 1]
+            u, v = maxima[i, 0], maxima[i, 1]
             slot = free_slots[free_count - 1]
-            birth = _Birth(0, 0, 0, np.float32(0.0))
-            if limits.patch_refinement:
-                set_bit(occupied, at)
-                birth = _take_patch(now, u, v, limits, slot, patches)
-                if birth.energy < np.float32(0.0):
-                    continue
+            set_bit(occupied, at)
+            birth = _take_patch(now, u, v, limits, slot, patches)
+            if birth.energy < np.float32(0.0):
+                continue
             set_square(occupied, x, y, spacing, height, width)
             load[y // cell, x // cell] += 1
             free_count -= 1

@@ -151,8 +151,6 @@ def reacquire_points(
     prior = prior.unless_contradicted(T_world_camera)
     placed = PlacedFrame(frame=frame, T_world_camera=T_world_camera, prior=prior)
     points, parameters, tracks = active.points, active.parameters, frame.tracks
-    if not parameters.reacquisition.enabled:
-        return placed
     reacquired = reacquire(
         T_world_camera, active.missing(frame.number), points, tracks.maxima,
         frame.given.extrema.maxima, frame.given.grey, active.camera, parameters.reacquisition,

@@ -67,7 +67,6 @@ class Atlas:
         self._next_segment = 1 + max((each.segment for each in known), default=-1)
         self._next_keyframe = known[-1].id + 1 if known else 0
         self._adjusted = False  # the whole active segment, not published yet
-        self._adjusts = parameters.window.final_adjustment
         for segment in take_in(known, self.points, calibration):
             self._earlier.keep(segment, calibration, known=True)
         self.places.know(known, calibration)
@@ -173,8 +172,7 @@ class Atlas:
     def add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int) -> None:
         """Store the pose of a frame relative to a keyframe of the active segment."""
         assert self.active is not None
-        if self._adjusts:
-            self.active.segment.path.add(frame, keyframe, T_world_camera, inliers)
+        self.active.segment.path.add(frame, keyframe, T_world_camera, inliers)
 
     def remember(self, keyframe: Keyframe, frame: IdealFrame, *, is_confirmed: bool = True) -> None:
         """Store a new keyframe as a place, and compare it with earlier places.
@@ -186,16 +184,15 @@ class Atlas:
         segment, view = self.active.segment, self.calibration.view
         seen, earlier = describe(frame.image), self._earlier.like(self.calibration)
         self.global_adjustment.loops += self.places.compare(
-            keyframe, seen, segment,
-            earlier if self._adjusts else [], view, self._parameters,
-            loops=self._adjusts and not self.global_adjustment.closing,
+            keyframe, seen, segment, earlier, view, self._parameters,
+            loops=not self.global_adjustment.closing,
             image=(frame.tracks.maxima, frame.image) if is_confirmed else None,
         )  # fmt: skip
         self.places.remember(keyframe, seen, [segment, *earlier], view)
 
     def request(self, frame: int) -> None:
         """Request a global bundle adjustment of the map after a frame, if one is due."""
-        if self.active is not None and self._adjusts:
+        if self.active is not None:
             self._request(frame, self.active)
 
     def _request(self, frame: int, active: ActiveMap) -> None:
@@ -308,8 +305,7 @@ class Atlas:
         active = self.active
         if active is None or not is_guess(self._parameters.calibration):
             return []
-        due = len(active.keyframes) >= self.calibration.next_keyframes
-        if not (due and self._adjusts):
+        if len(active.keyframes) < self.calibration.next_keyframes:
             return []
         self.global_adjustment = GlobalAdjustment()  # the running job is of the map before
         return [self._adjust(active)]
@@ -331,10 +327,9 @@ class Atlas:
         with timer("merging"):
             moved = self._join_met(0)
         active = self.active
-        if self._adjusts:
-            with timer("final adjustment"):
-                moves = self._earlier.adjust(self._parameters)
-            moved += [Moved(np.eye(4), held(each, self._spans, of)) for of, each in moves]
+        with timer("final adjustment"):
+            moves = self._earlier.adjust(self._parameters)
+        moved += [Moved(np.eye(4), held(each, self._spans, of)) for of, each in moves]
         if active is None:
             return moved
         with timer("merging"):
@@ -353,14 +348,10 @@ class Atlas:
 
     def _adjust_at_last(self, active: ActiveMap) -> list[Moved]:
         """Adjust the last active segment in the frame of its beginning."""
-        moved: list[Moved] = []
-        if self._adjusts:
-            back = active.segment.back()
-            if back is not None:
-                moved.append(self.move(held(back, self._spans, self.segment)))
-            active.collect_garbage()
-            moved.append(self._adjust(active))
-        return moved
+        back = active.segment.back()
+        moved = [] if back is None else [self.move(held(back, self._spans, self.segment))]
+        active.collect_garbage()
+        return [*moved, self._adjust(active)]
 
     def note_changed(self, journal: Journal, *, everything: bool) -> None:
         """Tell the journal which keyframes and landmarks may need to be published.
