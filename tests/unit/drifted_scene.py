@@ -26,7 +26,7 @@ AWAY = 80
 
 PARAMETERS = MappingParameters(
     window=WindowParameters(keyframes=5, keyframe_iterations=2),
-    reacquisition=ReacquisitionParameters(enabled=False),
+    reacquisition=ReacquisitionParameters(radius_px=0.01),
     whole_map=WholeMapParameters(growth=0.0, distance_frames=3),
 )
 
