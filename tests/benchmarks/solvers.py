@@ -16,7 +16,12 @@ from benchmarks.bundle_problems import Case, public_cases, synthetic_cases
 from benchmarks.ceres import CostCurve, solve_with_ceres
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import so3_exp
-from pliant.algorithms.slam.estimate.problem import BundleParameters, BundleProblem, BundleResult
+from pliant.algorithms.slam.estimate.problem import (
+    BundleParameters,
+    BundleProblem,
+    BundleResult,
+    BundleWindow,
+)
 from pliant.algorithms.slam.estimate.schur import solve_schur
 from pliant.algorithms.slam.estimate.subspace import solve_subspace
 from pliant.errors import PliantError
@@ -161,9 +166,26 @@ def _methods() -> list[tuple[str, Callable[..., BundleResult]]]:
         problem: BundleProblem, parameters: BundleParameters, on_iteration: Callable[[float], None]
     ) -> BundleResult:
         many = parameters.model_copy(update={"max_sweeps": SWEEPS})
-        return solve_subspace(problem, many, on_iteration)
+        return solve_subspace(_window_of(problem), many, on_iteration)
 
     return [("subspace", sweeps), ("Schur LM", solve_schur)]
+
+
+def _window_of(problem: BundleProblem) -> BundleWindow:
+    """The dense form, with points that the same camera sees first next to each other."""
+    m, n = problem.camera_index, problem.point_index
+    first = np.full(len(problem.points_world), len(problem.T_world_camera))
+    np.minimum.at(first, n, m)
+    order = np.argsort(first, kind="stable")
+    at = m, np.argsort(order)[n]
+    u, v, w = np.zeros((3, len(problem.T_world_camera), len(order)), np.float32)
+    u[at], v[at] = problem.points_px.T
+    w[at] = 1.0 if problem.weights is None else problem.weights
+    return BundleWindow(
+        T_world_camera=problem.T_world_camera, points_world=problem.points_world[order],
+        columns=np.arange(len(order), dtype=np.int32), u=u, v=v, weights=w, seen=w > 0.0,
+        intrinsics=problem.intrinsics, fixed_cameras=problem.fixed_cameras,
+    )  # fmt: skip
 
 
 def _measure(

@@ -11,8 +11,11 @@ from pliant.algorithms.slam.estimate.problem import (
     SHARED,
     BundleParameters,
     BundleProblem,
+    BundleResult,
+    BundleWindow,
     CalibrationUncertainty,
 )
+from pliant.algorithms.slam.estimate.subspace import solve_subspace
 
 F64 = NDArray[np.float64]
 
@@ -68,6 +71,26 @@ def make_scene(
         fixed_cameras=np.arange(cameras) < 2,
     )
     return Scene(problem, T, world)
+
+
+def to_window(problem: BundleProblem) -> BundleWindow:
+    """Every second column of a table, with others between that are no part of the problem."""
+    columns = 1 + 2 * np.arange(len(problem.points_world), dtype=np.int32)
+    u, v, w = np.full((3, len(problem.T_world_camera), 2 * len(columns) + 1), 7.0, np.float32)
+    seen = np.zeros(u.shape, np.bool_)
+    at = (problem.camera_index, columns[problem.point_index])
+    u[at], v[at], seen[at] = problem.points_px[:, 0], problem.points_px[:, 1], True
+    w[at] = 1.0 if problem.weights is None else problem.weights
+    return BundleWindow(
+        T_world_camera=problem.T_world_camera, points_world=problem.points_world, columns=columns,
+        u=u, v=v, weights=w, seen=seen, intrinsics=problem.intrinsics,
+        fixed_cameras=problem.fixed_cameras,
+    )  # fmt: skip
+
+
+def sweep(problem: BundleProblem, parameters: BundleParameters) -> BundleResult:
+    """The subspace method alone."""
+    return solve_subspace(to_window(problem), parameters)
 
 
 def project(T_world_camera: F64, points_world: F64, intrinsics: F64) -> F64:

@@ -4,12 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from bundle_scene import make_scene, move, project
+from bundle_scene import make_scene, move, project, sweep
 
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.slam.estimate.pose import Correspondences, refine_pose
 from pliant.algorithms.slam.estimate.problem import BundleParameters
-from pliant.algorithms.slam.estimate.subspace import solve_subspace
 
 CAMERA = PinholeCamera(width=640, height=480, fx=500.0, fy=520.0, cx=320.0, cy=240.0)
 PARAMETERS = BundleParameters(kernel_sigma_px=2.0, min_relative_decrease=1e-8)
@@ -80,7 +79,7 @@ def test_points_are_triangulated_with_given_cameras(distortion):
         T_world_camera=scene.T_world_camera,
         fixed_cameras=np.ones(len(scene.T_world_camera), np.bool_),
     )
-    result = solve_subspace(problem, PARAMETERS.model_copy(update={"max_sweeps": 50}))
+    result = sweep(problem, PARAMETERS.model_copy(update={"max_sweeps": 50}))
     assert np.array_equal(result.T_world_camera, scene.T_world_camera)
     error = np.linalg.norm(result.points_world - scene.points_world, axis=1)
     assert np.median(error) < 1e-3

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bundle_scene import make_scene, move
+from bundle_scene import make_scene, move, to_window
 from mapping_scene import CAMERA, looking
 
 from pliant.algorithms.geometry import inverse, so3_exp, so3_log, transform
@@ -175,7 +175,7 @@ def test_sweeps_respect_a_prior_of_the_last_camera_as_the_pose_alone_does():
     information = refine_pose(start, seen, camera, PARAMETERS).information
     for factor in (0.0, 1.0, 1e4):
         prior = PosePrior(mean, factor * information)
-        found = solve_subspace(problem, sweeps, prior=prior)
+        found = solve_subspace(to_window(problem), sweeps, prior=prior)
         alone = refine_pose(start, seen._replace(prior=prior), camera, PARAMETERS, iterations=50)
         np.testing.assert_allclose(found.T_world_camera[4], alone.T_world_camera, atol=2e-3)
         assert (np.diff(found.costs) <= 1e-5 * found.costs[:-1]).all()

@@ -11,7 +11,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.slam.estimate.problem import AnyProblem, BundleProblem
+from pliant.algorithms.slam.estimate.problem import AnyProblem, BundleWindow
 from pliant.algorithms.slam.estimate.projection import Cameras
 from pliant.compiler.kernel import kernel
 
@@ -56,25 +56,17 @@ class Layout(Unknowns):
     table: Table
 
 
-def build_layout(problem: AnyProblem) -> Layout:
+def build_layout(problem: BundleWindow) -> Layout:
     """Convert a problem to the dense layout, without changing it."""
     M, N = len(problem.T_world_camera), len(problem.points_world)
     P = max(1, -(-N // BLOCK)) * BLOCK
-    column, usable = columns_of(problem), finite_points(problem.points_world)
+    usable = finite_points(problem.points_world)
     u, v, w = np.zeros((3, M, P), np.float32)
     seen = np.zeros((M, P // BLOCK), np.uint8)
-    if isinstance(problem, BundleProblem):
-        _scatter(
-            problem.camera_index, problem.point_index, problem.points_px, weights_of(problem),
-            column, usable, u, v, w,
-        )  # fmt: skip
-    else:
-        _select(
-            problem.columns, usable, problem.u, problem.v, problem.weights, problem.seen, u, v, w
-        )  # fmt: skip
+    _select(problem.columns, usable, problem.u, problem.v, problem.weights, problem.seen, u, v, w)
     _mark_blocks(w, seen)
-    table = Table(u, v, w, seen)
-    return Layout(**vars(unknowns_of(problem, column, usable, P)), table=table)
+    unknowns = unknowns_of(problem, np.arange(N), usable, P)
+    return Layout(**vars(unknowns), table=Table(u, v, w, seen))
 
 
 @kernel
@@ -85,13 +77,6 @@ def finite_points(points_world: F64) -> BoolArray:
         x, y, z = points_world[n, 0], points_world[n, 1], points_world[n, 2]
         finite[n] = np.isfinite(x) and np.isfinite(y) and np.isfinite(z)
     return finite
-
-
-def weights_of(problem: BundleProblem) -> F32:
-    """(O,) factors of the cost terms."""
-    if problem.weights is not None:
-        return problem.weights
-    return np.ones(len(problem.camera_index), np.float32)
 
 
 def unknowns_of(problem: AnyProblem, column: I64, usable: BoolArray, P: int) -> Unknowns:
@@ -130,75 +115,6 @@ def points_of(layout: Unknowns, problem: AnyProblem, points: F64) -> F64:
     out = problem.points_world.copy()
     _shift_back(points, layout.points, layout.column, layout.origin, out)
     return out
-
-
-def residuals_of(layout: Layout, problem: BundleProblem, squared: F32) -> F32:
-    """From (M, P) squared residuals to those of the problem's own observations."""
-    return _gather(problem.camera_index, problem.point_index, layout.column, squared)
-
-
-def columns_of(problem: AnyProblem) -> I64:
-    """(N,) column of each point: points with the same cameras are adjacent."""
-    N = len(problem.points_world)
-    if not isinstance(problem, BundleProblem):
-        return np.arange(N)
-    return _sort_by_cameras(
-        problem.camera_index, problem.point_index, len(problem.T_world_camera), N
-    )
-
-
-@kernel
-def _sort_by_cameras(camera_index: I32, point_index: I32, cameras: int, points: int) -> I64:
-    """Rank of each point by the first camera that sees it, then the last, then its number."""
-    first = np.full(points, cameras, np.int64)
-    last = np.zeros(points, np.int64)
-    for k in range(camera_index.size):
-        n, m = point_index[k], camera_index[k]
-        first[n] = min(first[n], m)
-        last[n] = max(last[n], m)
-    order = np.arange(points)
-    rank = np.empty(points, np.int64)
-    # Two stable counting sorts, the less important key before the other.
-    for key in (last, first):
-        start = np.zeros(cameras + 2, np.int64)
-        for n in range(points):
-            start[key[n] + 1] += 1
-        start = np.cumsum(start)
-        for n in order:
-            rank[n] = start[key[n]]
-            start[key[n]] += 1
-        for n in range(points):
-            order[rank[n]] = n
-    return rank
-
-
-@kernel
-def _gather(camera_index: I32, point_index: I32, column: I64, squared: F32) -> F32:
-    out = np.empty(camera_index.size, np.float32)
-    for k in range(camera_index.size):
-        out[k] = squared[camera_index[k], column[point_index[k]]]
-    return out
-
-
-@kernel
-def _scatter(
-    camera_index: I32,
-    point_index: I32,
-    points_px: F32,
-    weights: F32,
-    column: I64,
-    usable: BoolArray,
-    u: F32,
-    v: F32,
-    w: F32,
-) -> None:
-    for k in range(camera_index.size):
-        m, n = camera_index[k], point_index[k]
-        finite = np.isfinite(points_px[k, 0]) and np.isfinite(points_px[k, 1])
-        if usable[n] and finite and weights[k] > 0.0:
-            u[m, column[n]] = points_px[k, 0]
-            v[m, column[n]] = points_px[k, 1]
-            w[m, column[n]] = weights[k]
 
 
 @kernel

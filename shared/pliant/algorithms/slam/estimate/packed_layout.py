@@ -14,10 +14,8 @@ from pliant.algorithms.arrays import F32, I32, I64, BoolArray
 from pliant.algorithms.slam.estimate.dense_layout import (
     BLOCK,
     Unknowns,
-    columns_of,
     finite_points,
     unknowns_of,
-    weights_of,
 )
 from pliant.algorithms.slam.estimate.problem import AnyProblem, BundleProblem
 from pliant.compiler.kernel import kernel
@@ -69,8 +67,8 @@ class PackedLayout(Unknowns):
 def build_packed_layout(problem: AnyProblem) -> PackedLayout:
     """Convert a problem to the packed layout, without changing it."""
     N, usable = len(problem.points_world), finite_points(problem.points_world)
-    unknowns = unknowns_of(problem, columns_of(problem), usable, N)
     if not isinstance(problem, BundleProblem):
+        unknowns = unknowns_of(problem, np.arange(N), usable, N)
         table = (problem.columns, usable, problem.u, problem.v, problem.weights, problem.seen)
         counts, start = _count(*table)
         slots, places, first = _room(counts, start)
@@ -78,8 +76,10 @@ def build_packed_layout(problem: AnyProblem) -> PackedLayout:
         place, flow = np.zeros(0, np.int32), np.zeros((2, 0, BLOCK), np.float32)
         return PackedLayout(**vars(unknowns), slots=slots, places=places, place=place, flow=flow)
     camera_index, point_index = problem.camera_index, problem.point_index
+    column = _sort_by_cameras(camera_index, point_index, len(problem.T_world_camera), N)
+    unknowns = unknowns_of(problem, column, usable, N)
     u, v = (np.ascontiguousarray(each) for each in problem.points_px.T)
-    weights = weights_of(problem)
+    weights = np.ones(len(u), np.float32) if problem.weights is None else problem.weights
     order, counts, start = _sort(
         camera_index, point_index, u, v, weights, usable, unknowns.column,
         len(unknowns.free), N,
@@ -115,6 +115,31 @@ def _room(counts: I64, start: I64) -> tuple[Slots, Places, I64]:
     )
     places = Places(start, start.copy(), np.zeros(observations, np.int32))
     return slots, places, BLOCK * (np.cumsum(blocks) - blocks)
+
+
+@kernel
+def _sort_by_cameras(camera_index: I32, point_index: I32, cameras: int, points: int) -> I64:
+    """Rank of each point by the first camera that sees it, then the last, then its number."""
+    first = np.full(points, cameras, np.int64)
+    last = np.zeros(points, np.int64)
+    for k in range(camera_index.size):
+        n, m = point_index[k], camera_index[k]
+        first[n] = min(first[n], m)
+        last[n] = max(last[n], m)
+    order = np.arange(points)
+    rank = np.empty(points, np.int64)
+    # Two stable counting sorts, the less important key before the other.
+    for key in (last, first):
+        start = np.zeros(cameras + 2, np.int64)
+        for n in range(points):
+            start[key[n] + 1] += 1
+        start = np.cumsum(start)
+        for n in order:
+            rank[n] = start[key[n]]
+            start[key[n]] += 1
+        for n in range(points):
+            order[rank[n]] = n
+    return rank
 
 
 @kernel

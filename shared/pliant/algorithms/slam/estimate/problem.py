@@ -1,6 +1,6 @@
 """Input and output of bundle adjustment: cameras, points and observations.
 
-Two forms of the same problem are accepted everywhere: ``BundleProblem`` lists its observations,
+Two forms of the same problem: ``BundleProblem`` lists its observations, for Schur LM;
 ``BundleWindow`` selects them from dense camera x point arrays, as a window of keyframes has them.
 """
 

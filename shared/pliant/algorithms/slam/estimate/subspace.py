@@ -19,7 +19,6 @@ from pliant.algorithms.slam.estimate.dense_layout import (
     build_layout,
     points_of,
     poses_of,
-    residuals_of,
 )
 from pliant.algorithms.slam.estimate.pose_prior import (
     NO_PRIOR,
@@ -28,10 +27,9 @@ from pliant.algorithms.slam.estimate.pose_prior import (
     shifted_motion,
 )
 from pliant.algorithms.slam.estimate.problem import (
-    AnyProblem,
     BundleParameters,
-    BundleProblem,
     BundleResult,
+    BundleWindow,
 )
 from pliant.algorithms.slam.estimate.projection import (
     Cameras,
@@ -50,7 +48,7 @@ from pliant.compiler.kernel import fast_kernel
 
 
 def solve_subspace(
-    problem: AnyProblem,
+    problem: BundleWindow,
     parameters: BundleParameters,
     on_iteration: Callable[[float], None] | None = None,
     *,
@@ -88,23 +86,6 @@ def solve_subspace(
             break
     last = total_cost(layout, motion, points, parameters) + 0.5 * prior_cost(motion[-1], mean, L)
     costs = [*costs[:-1], last] if costs else [last]
-    return make_result(problem, layout, motion, points, costs, converged, parameters)
-
-
-def make_result(
-    problem: AnyProblem,
-    layout: Layout,
-    motion: F64,
-    points: F64,
-    costs: list[float],
-    converged: bool,
-    parameters: BundleParameters,
-) -> BundleResult:
-    """Convert the result to the form of the problem."""
-    squared = np.zeros(0, np.float32)
-    if isinstance(problem, BundleProblem):
-        table = squared_residuals(layout, motion, points, parameters)
-        squared = residuals_of(layout, problem, table)
     return BundleResult(
         T_world_camera=poses_of(layout, problem, motion),
         points_world=points_of(layout, problem, points),
@@ -112,7 +93,7 @@ def make_result(
         final_cost=costs[-1],
         iterations=len(costs) - 1,
         converged=converged,
-        squared_residuals=squared,
+        squared_residuals=np.zeros(0, np.float32),
         costs=np.array(costs),
     )
 
