@@ -15,22 +15,27 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.slam.active.active_map import ActiveMap
-from pliant.algorithms.slam.active.frame_pose import localise, reacquire_points, to_global_shutter
+from pliant.algorithms.slam.active.frame_pose import (
+    judge_tracks,
+    locate_in_map,
+    reacquire_points,
+    to_global_shutter,
+    with_support,
+)
 from pliant.algorithms.slam.active.tracked_pose import pose_by_tracks
 from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment
 from pliant.algorithms.slam.atlas.known_places import KnownPlaces
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
-from pliant.algorithms.slam.estimate.observation_table import reprojection_errors
 from pliant.algorithms.slam.frame import Frame, IdealFrame, PlacedFrame
 from pliant.algorithms.slam.journal import Journal, Outcome
 from pliant.algorithms.slam.locate.landmark_search import LandmarkSearch
 from pliant.algorithms.slam.locate.localisation import Motion
-from pliant.algorithms.slam.locate.pose_quality import support_of, why_doubtful
+from pliant.algorithms.slam.locate.pose_quality import why_doubtful
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.algorithms.slam.map.landmarks import MAPPED, Landmarks
 from pliant.algorithms.slam.parameters import MappingParameters
-from pliant.algorithms.slam.places.relocalisation import Recognised, is_same_pose
+from pliant.algorithms.slam.places.relocalisation import Recognised
 from pliant.algorithms.slam.store.kept_map import known_camera, take_in
 from pliant.algorithms.stages import StageTimer, no_stages
 
@@ -149,30 +154,21 @@ class Localiser:
         return self._journal.publish_keyframes(None, self.calibration)
 
     def _locate(self, frame: IdealFrame, timer: StageTimer) -> F64 | None:
-        there = None
-        if self._map is not None and self._motion is not None:
-            with timer("localisation"):
-                located = localise(self._map, self._motion, frame, self._generator)
-            there = None if located is None else located.T_world_camera
-            if located is not None and located.is_firm:
-                return there
-        if not frame.has_image:
-            return there
-        with timer("places"):
-            found = self.recognise(frame.tracks.maxima, frame.image, self._generator)
-        if found is None:
-            return there
-        if there is not None and self._map is not None:
-            same = found.keyframe.segment == self._map.segment.id
-            if same and is_same_pose(there, found.T_world_camera, found.keyframe, self._points):
-                return there
-        self._reference, self._motion = found.keyframe, None
-        segment = next(each for each in self._segments if each.id == found.keyframe.segment)
-        self._map = ActiveMap(segment, 0, self.calibration, self._parameters)
-        self._map.links.follow(frame.tracks.ids, self._points)
-        self._map.activate_near(found.T_world_camera)
-        self._activated_from = found.T_world_camera
-        return found.T_world_camera
+        """T_world_camera of the frame, by continuing or by recognition."""
+        located, place = locate_in_map(
+            self._map, self._motion, frame, self._generator, self._recognise, timer
+        )
+        if place is not None:
+            self._reference, self._motion = place.keyframe, None
+            segment = next(each for each in self._segments if each.id == place.keyframe.segment)
+            self._map = ActiveMap(segment, 0, self.calibration, self._parameters)
+            self._map.links.follow(frame.tracks.ids, self._points)
+            self._map.activate_near(place.T_world_camera)
+            self._activated_from = place.T_world_camera
+        return located
+
+    def _recognise(self, frame: IdealFrame) -> Recognised | None:
+        return self.recognise(frame.tracks.maxima, frame.image, self._generator)
 
     def _activate_near(self, active: ActiveMap, T_world_camera: F64) -> bool:
         """Whether the camera has moved so far that other keyframes may be covisible."""
@@ -193,21 +189,14 @@ class Localiser:
 
     def _find(self, active: ActiveMap, frame: IdealFrame, T_world_camera: F64) -> PlacedFrame:
         """The pose by all reacquired landmarks, and its quality."""
-        parameters, camera = self._parameters, active.camera
         if self._motion is not None:
             frame = to_global_shutter(active, self._motion, frame, T_world_camera)
         placed = reacquire_points(active, frame, T_world_camera)
-        linked = active.linked(MAPPED)
-        rows, points_px = active.observed(placed, np.zeros(0, np.int64))
-        xyz = self._points.xyz[rows]
-        errors = reprojection_errors(placed.T_world_camera, xyz, points_px, camera)
-        active.judge_tracks(linked, errors[: len(linked)])
         interval_s = 0.0 if self._motion is None else self._motion.interval_s()
-        settled = frame.tracks.ages * interval_s >= parameters.support.settled_s
-        inliers = errors < parameters.localisation.inlier_px
-        settled_px = frame.tracks.points_px[settled]
-        support = support_of(points_px, inliers, len(linked), settled_px, camera)
-        return replace(placed, support=support)
+        settled = frame.tracks.ages * interval_s >= self._parameters.support.settled_s
+        placed = with_support(active, placed, frame.tracks.points_px[settled])
+        judge_tracks(active, placed)
+        return placed
 
     def _publish_placed(
         self, reference: Keyframe, placed: PlacedFrame, *, has_activated: bool = False

@@ -21,7 +21,7 @@ from pliant.algorithms.slam.active.frame_pose import (
     adjust,
     check_pure_rotation,
     limits_of_points,
-    localise,
+    locate_in_map,
     reacquire_points,
     to_global_shutter,
     tracks_to_points,
@@ -47,7 +47,7 @@ from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.algorithms.slam.map.landmarks import MAPPED
 from pliant.algorithms.slam.parameters import MappingParameters
-from pliant.algorithms.slam.places.relocalisation import is_same_pose
+from pliant.algorithms.slam.places.relocalisation import Recognised
 from pliant.algorithms.slam.start.first_map import Start
 from pliant.algorithms.slam.start.focal_hypotheses import find_start_of
 from pliant.algorithms.slam.start.initialisation_buffer import (
@@ -122,7 +122,7 @@ class Mapper:
 
     @property
     def point_count(self) -> int:
-        """As of the atlas."""
+        """Number of landmarks in all segments."""
         return self.atlas.point_count
 
     @property
@@ -132,7 +132,7 @@ class Mapper:
         return self.atlas.places.comparisons.counters | self.atlas.dropped | turned
 
     def kept(self) -> Iterator[KeptKeyframe]:
-        """As of the atlas."""
+        """Yield the keyframes of the map to be saved."""
         return self.atlas.kept()
 
     def process(self, frame: Frame, timer: StageTimer = no_stages) -> MapDelta:
@@ -148,24 +148,10 @@ class Mapper:
             return self._wait(ideal, timer)
         if located is None:
             return self._lost(active, ideal)
-        with timer("reacquisition"):
-            ideal = to_global_shutter(active, self._motion, ideal, located)
-            placed = reacquire_points(active, ideal, located, self._motion.prior(self._camera))
-        with timer("subspace adjustment"):
-            placed = adjust(active, self._motion, placed)
-        with timer("triangulation"):
-            limits = limits_of_points(placed.support.inliers, self._parameters)
-            active.window.triangulate(limits)
-        self._keyframe_is_new = self._keyframe_is_due(active, frame.stamp_ns)
-        if self._keyframe_is_new:
-            placed = self._insert_keyframe(active, placed, timer)
-        else:
-            active.add_ordinary(placed)
-        with timer("passed frames"):
-            rooms = 1 if self._keyframe_is_new else STANDING_ROOMS
-            surplus = active.segment.ordinary.take_surplus(self._parameters, rooms)
-            self._correct(active.segment, surplus, self.calibration)
-        self._lost_frames = 0
+        placed = self._reacquire(active, ideal, located, timer)
+        placed = self._adjust(active, placed, timer)
+        placed = self._attach(active, placed, timer)
+        self._refine_passed(active.segment, timer)
         self._go_on_from(active, placed, self._motion.then)
         if self._keyframe_is_new:
             self.atlas.request(frame.number)
@@ -192,6 +178,39 @@ class Mapper:
         if self._gyro is not None:
             turn = self._gyro.turn(self._motion.stamps_ns[1], stamp_ns)
             self._motion = replace(self._motion, turn=turn)
+
+    def _reacquire(
+        self, active: ActiveMap, frame: IdealFrame, located: F64, timer: StageTimer
+    ) -> PlacedFrame:
+        """Find landmarks that have lost their tracks."""
+        with timer("reacquisition"):
+            frame = to_global_shutter(active, self._motion, frame, located)
+            return reacquire_points(active, frame, located, self._motion.prior(self._camera))
+
+    def _adjust(self, active: ActiveMap, placed: PlacedFrame, timer: StageTimer) -> PlacedFrame:
+        """Adjust the frame with its landmarks, and triangulate others."""
+        with timer("subspace adjustment"):
+            placed = adjust(active, self._motion, placed)
+        with timer("triangulation"):
+            limits = limits_of_points(placed.support.inliers, self._parameters)
+            active.window.triangulate(limits)
+        return placed
+
+    def _attach(self, active: ActiveMap, placed: PlacedFrame, timer: StageTimer) -> PlacedFrame:
+        """Make the frame a keyframe if one is due, or attach it to the last one."""
+        self._lost_frames = 0
+        self._keyframe_is_new = self._keyframe_is_due(active, placed.frame.stamp_ns)
+        if self._keyframe_is_new:
+            return self._insert_keyframe(active, placed, timer)
+        active.add_ordinary(placed)
+        return placed
+
+    def _refine_passed(self, segment: Segment, timer: StageTimer) -> None:
+        """Refine earlier frames that are no keyframes."""
+        with timer("passed frames"):
+            rooms = 1 if self._keyframe_is_new else STANDING_ROOMS
+            surplus = segment.ordinary.take_surplus(self._parameters, rooms)
+            self._correct(segment, surplus, self.calibration)
 
     def _keyframe_is_due(self, active: ActiveMap, stamp_ns: int) -> bool:
         if active.segment.resumes:
@@ -393,39 +412,22 @@ class Mapper:
         return newest.inliers
 
     def _locate(self, frame: IdealFrame, timer: StageTimer) -> F64 | None:
-        """T_world_camera of the frame, by continuing or by recognition."""
-        active, located = self.atlas.active, None
-        if active is not None:
-            with timer("localisation"):
-                located = localise(active, self._motion, frame, self._generator)
-            if located is not None and located.is_firm:
-                return located.T_world_camera
-        with timer("places"):
-            return self._recognise(frame, None if located is None else located.T_world_camera)
-
-    def _recognise(self, frame: IdealFrame, there: F64 | None) -> F64 | None:
-        """T_world_camera in the segment that the image shows, which becomes active.
-
-        there: the pose of a few tracks, which counts if the image shows no other place.
+        """T_world_camera of the frame, by continuing or by recognition, whose segment becomes the
+        active one.
         """
-        if not frame.has_image:
-            return there
-        found = self.atlas.recognise(frame.image, frame.tracks.maxima, self._generator)
-        if found is None:
-            return there
-        keyframe, pose = found.keyframe, found.T_world_camera
-        if (
-            there is not None
-            and keyframe.segment == self.atlas.segment
-            and is_same_pose(there, pose, keyframe, self.atlas.points)
-        ):
-            return there
-        if self.atlas.active is not None:
-            self.journal.settle(self.atlas.active.keyframes)
-        self.atlas.go_on(keyframe, frame.tracks.ids)
-        self._motion = Motion.at(frame.number, frame.stamp_ns, pose)
-        self._recognised = keyframe.id
-        return pose
+        located, place = locate_in_map(
+            self.atlas.active, self._motion, frame, self._generator, self._recognise, timer
+        )
+        if place is not None:
+            if self.atlas.active is not None:
+                self.journal.settle(self.atlas.active.keyframes)
+            self.atlas.go_on(place.keyframe, frame.tracks.ids)
+            self._motion = Motion.at(frame.number, frame.stamp_ns, place.T_world_camera)
+            self._recognised = place.keyframe.id
+        return located
+
+    def _recognise(self, frame: IdealFrame) -> Recognised | None:
+        return self.atlas.recognise(frame.image, frame.tracks.maxima, self._generator)
 
     def _place_waiting(self, active: ActiveMap, keyframe: Keyframe, T_world_camera: F64) -> None:
         """Place the frames between a loss and the recognition, if their tracks lead to landmarks in

@@ -4,6 +4,7 @@ It is estimated from the tracks of landmarks, refined by reacquired landmarks, a
 with the window (VITAMIN-E section 3.2, Eq. 6).
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -32,6 +33,8 @@ from pliant.algorithms.slam.map.keyframe import Observations
 from pliant.algorithms.slam.map.landmarks import MAPPED
 from pliant.algorithms.slam.map.track_links import UNLINKED
 from pliant.algorithms.slam.parameters import MappingParameters, PointParameters
+from pliant.algorithms.slam.places.relocalisation import Recognised, is_same_pose
+from pliant.algorithms.stages import StageTimer
 from pliant.algorithms.tracks import FrameTracks
 
 _AGREEING = 0.5
@@ -54,6 +57,45 @@ _FEW, _FIRM = 0.05, 0.2
 """Minimum shares of the last frame's tracks that fit a pose: after a cut, 0.3 to 2 % fit by chance,
 and 9 % where the views overlap; the fastest rotations with blur leave 11 to 20 %.
 """
+
+
+def locate_in_map(
+    active: ActiveMap | None,
+    motion: Motion | None,
+    frame: IdealFrame,
+    generator: np.random.Generator,
+    recognise: Callable[[IdealFrame], Recognised | None],
+    timer: StageTimer,
+) -> tuple[F64 | None, Recognised | None]:
+    """Return T_world_camera of a frame, and the place if its image shows another one than its
+    tracks.
+
+    active, motion: None where the camera is not in the map yet.   recognise: the place by the
+    image.   Firm tracks need no image; the pose of a few counts if the image shows no other place.
+    """
+    there = None
+    if active is not None and motion is not None:
+        with timer("localisation"):
+            located = localise(active, motion, frame, generator)
+        if located is not None:
+            there = located.T_world_camera
+            if located.is_firm:
+                return there, None
+    if not frame.has_image:
+        return there, None
+    with timer("places"):
+        found = recognise(frame)
+    if found is None:
+        return there, None
+    pose, keyframe = found.T_world_camera, found.keyframe
+    if (
+        there is not None
+        and active is not None
+        and keyframe.segment == active.segment.id
+        and is_same_pose(there, pose, keyframe, active.points)
+    ):
+        return there, None
+    return pose, found
 
 
 class Located(NamedTuple):
@@ -202,14 +244,20 @@ def _track_errors(active: ActiveMap, placed: PlacedFrame) -> tuple[I64, F32]:
 
 def supported(active: ActiveMap, motion: Motion, placed: PlacedFrame) -> PlacedFrame:
     """Return the frame with the quality of its pose.  motion: before it."""
-    T_world_camera, tracks = placed.T_world_camera, placed.frame.tracks
+    tracks = placed.frame.tracks
+    settled = _settled(active, motion, tracks)
+    settled[_contradicting(active, placed.T_world_camera, tracks.points_px)] = True
+    return with_support(active, placed, tracks.points_px[settled])
+
+
+def with_support(active: ActiveMap, placed: PlacedFrame, settled_px: F32) -> PlacedFrame:
+    """Return the frame with its support.   settled_px: (N, 2) of tracks that should support it."""
+    T_world_camera = placed.T_world_camera
     rows, points_px = active.observed(placed, active.helping_candidates())
     errors = reprojection_errors(T_world_camera, active.points.xyz[rows], points_px, active.camera)
     inliers = errors < active.parameters.localisation.inlier_px
-    settled = _settled(active, motion, tracks)
-    settled[_contradicting(active, T_world_camera, tracks.points_px)] = True
     tracked = len(rows) - len(placed.found.rows)
-    support = support_of(points_px, inliers, tracked, tracks.points_px[settled], active.camera)
+    support = support_of(points_px, inliers, tracked, settled_px, active.camera)
     return replace(placed, support=support)
 
 
