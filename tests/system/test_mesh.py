@@ -43,7 +43,7 @@ def test_a_run_leaves_meshes_pictures_and_figures(result: Path) -> None:
 def test_the_mesh_against_the_truth(result: Path, tmp_path: Path) -> None:
     figures = tmp_path / "figures.json"
     folder = shutil.copytree(result, tmp_path / "result")
-    done = pliant("eval", folder, "--groundtruth", TINY, "--mesh", "--json", figures)
+    done = in_this_process("eval", folder, "--groundtruth", TINY, "--mesh", "--json", figures)
     assert done.returncode == 0, done.stderr
     found = json.loads(figures.read_text())["mesh"]
     assert found["median_error"] < 0.01
@@ -73,7 +73,7 @@ def test_a_mesher_that_is_killed_fuses_again_and_the_mesh_is_that_of_an_ordinary
     assert digests(output) == digests(result)
     for name in ("mesh.ply", "mesh_coarse.ply", "mesh.png"):
         assert (output / name).read_bytes() == (result / name).read_bytes(), name
-    assert pliant("info", output).returncode == 0
+    assert in_this_process("info", output).returncode == 0
     meshes = [json.loads((of / "report.json").read_text())["mesh"] for of in (output, result)]
     assert meshes[0] == meshes[1]
     # A power cut after the end, before the state was cleared away.

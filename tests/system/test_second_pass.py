@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from running import TINY, assert_one_line, digests, in_this_process, pliant
+from running import NO_MESH, TINY, assert_one_line, digests, in_this_process, pliant
 
 from pliant.datasets.builtin import builtin_folder
 from pliant.datasets.source_spec import SourceSpec
@@ -105,7 +105,7 @@ def test_the_first_result_stays_if_the_second_pass_fails(
 
 
 def test_where_nothing_is_lost_the_first_result_is_the_best(tiny_run: Path, tmp_path: Path) -> None:
-    done = pliant("run", TINY, "--quality", "high", "--output", tmp_path / "tiny")
+    done = pliant("run", TINY, "--quality", "high", *NO_MESH, "--output", tmp_path / "tiny")
     assert done.returncode == 0, done.stderr
     assert "second pass: no frame with image content was lost" in done.stderr
     assert digests(tmp_path / "tiny") == digests(tiny_run)

@@ -79,7 +79,7 @@ def test_status_and_stop_of_a_session_in_parts(endpoint: str, tmp_path) -> None:
         assert {name: service.wait(60) for name, service in services.items()} == dict.fromkeys(
             services, 0
         )
-    info = pliant("info", str(tmp_path / "recording.mcap"))
+    info = in_this_process("info", str(tmp_path / "recording.mcap"))
     assert info.returncode == 0, info.stderr
 
 

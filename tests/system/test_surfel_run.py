@@ -112,7 +112,7 @@ def test_a_replay_and_a_run_on_the_recording_give_the_same(result: Path, tmp_pat
 
 
 def test_the_surface_is_a_mesh_for_every_other_frame(result: Path, tmp_path: Path) -> None:
-    done = pliant(
+    done = in_this_process(
         "export", result, "--to", "surface", "--every", "2", "--output", tmp_path / "surface"
     )
     assert done.returncode == 0, done.stderr
@@ -126,7 +126,9 @@ def test_the_surface_is_a_mesh_for_every_other_frame(result: Path, tmp_path: Pat
 
 
 def test_the_animation_has_the_colours_of_the_images(result: Path, tmp_path: Path) -> None:
-    done = pliant("export", result, "--to", "animation", "--output", tmp_path / "surface.glb")
+    done = in_this_process(
+        "export", result, "--to", "animation", "--output", tmp_path / "surface.glb"
+    )
     assert done.returncode == 0, done.stderr
     data = (tmp_path / "surface.glb").read_bytes()
     size = int.from_bytes(data[12:16], "little")
@@ -147,7 +149,9 @@ def test_its_poses_are_exported(result: Path, tmp_path: Path) -> None:
 
 
 def test_the_overlay_shows_how_each_surfel_fares(result: Path, tmp_path: Path) -> None:
-    done = pliant("export", result, "--to", "overlay", "--output", tmp_path / "surfels.avi")
+    done = in_this_process(
+        "export", result, "--to", "overlay", "--output", tmp_path / "surfels.avi"
+    )
     assert done.returncode == 0, done.stderr
     video = cv2.VideoCapture(str(tmp_path / "surfels.avi"))
     pictures = [video.read()[1] for _ in range(FRAMES)]
