@@ -33,7 +33,7 @@ _FLAGS_OF_V4 = {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}
 
 
 def fix() -> None:
-    """Have the libraries compute in one thread, and for the target where the processor has it.
+    """Limit the libraries to one thread, and to the target if the processor supports it.
 
     Where numpy is loaded its BLAS gets one thread; what it computes for can no longer be changed.
     """

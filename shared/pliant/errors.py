@@ -46,4 +46,4 @@ class ResultError(PliantError):
 
 
 class StateError(PliantError):
-    """The state of a service cannot be kept, or what was kept cannot be read."""
+    """The state of a service cannot be saved or loaded."""

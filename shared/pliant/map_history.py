@@ -107,7 +107,7 @@ def _grown(array: np.ndarray[Any, Any], size: int) -> np.ndarray[Any, Any]:
 class Points:
     """The map's points.  Arrays as in MapDelta, one row for each point that exists.
 
-    hosts: the keyframe on which each hangs.
+    hosts: the reference keyframe of each.
     frames: the frame whose update first had the point, which observed it.
     """
 

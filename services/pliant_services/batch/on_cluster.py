@@ -21,7 +21,7 @@ _CUT_OFF_S = 30.0
 
 
 def load_dask() -> Any:
-    """The module ``distributed``.  Raises ResultError where it is not installed."""
+    """Return the module ``distributed``.  Raises ResultError if it is not installed."""
     try:
         import distributed
     except ImportError:

@@ -149,7 +149,7 @@ class OneRun:
                     return None
 
     def last_words(self) -> str:
-        """The last line that it said."""
+        """The last line of its output."""
         lines = self._log.read_text(encoding="utf-8", errors="replace").split("\n")
         return next((line for line in reversed(lines) if line.strip()), "").removeprefix("pliant: ")
 

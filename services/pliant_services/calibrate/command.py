@@ -61,7 +61,7 @@ _CELLS = 32
 """Columns of cells in which the picture without a board shows the residuals."""
 _MANY = 10
 """Sights of points that a cell needs for that."""
-_WHOLE_PX = 1 << 20  # no images are this large: they are not made smaller
+_WHOLE_PX = 1 << 20  # larger than any image, so that none is made smaller
 
 
 @dataclass(frozen=True, kw_only=True)

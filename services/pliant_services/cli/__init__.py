@@ -70,7 +70,7 @@ _UsageError: type[typer.BadParameter] = next(
 
 
 def main(application: typer.Typer | None = None) -> None:
-    """The command ``pliant``, or another that ends as it does."""
+    """Run the command ``pliant``, or another with the same exit codes."""
     # A container stops by SIGTERM and a terminal that closes sends SIGHUP: both are a Ctrl-C.
     for kind in _INTERRUPTIONS:
         if signal.getsignal(kind) == signal.SIG_DFL:  # not under nohup

@@ -30,7 +30,7 @@ class GroupedOptions(TyperCommand):
 
 
 def grouped_options(command: Any, context: Any) -> dict[str, list[tuple[str, str]]]:
-    """Arguments and options of a command as its help page has them, by heading."""
+    """Arguments and options of a command, grouped as on its help page."""
     groups: dict[str, list[tuple[str, str]]] = {}
     for parameter in command.get_params(context):
         record = parameter.get_help_record(context)

@@ -109,7 +109,7 @@ def run(
             dropped += source.dropped
             broken += image.missing.startswith(BROKEN)
             if clip is not None and not clip.is_as_it_was():
-                clip = None  # what is read of it now is not what was sent
+                clip = None  # the file now differs from what was sent
             bus.publish(topics.SOURCE, _source_message(source, image, clip is not None))
             may_lag = readers_that_may_lag(image)
             bus.publish(topics.IMAGE, link.image(image, source), may_lag=may_lag)

@@ -193,7 +193,7 @@ def _start(
 def _add(
     state: _State, image: U8, frame: SurfelFrame, view: MapView, config: Config
 ) -> tuple[SurfelFrame, str]:
-    """More surfels on a later keyframe of our own map, and else why there are none."""
+    """Create surfels on a later keyframe of our own map; otherwise return the reason why not."""
     if not frame.lost:
         found = agree(view.depth, frame, config.surfels.patch_px)
         if found.depth is None:

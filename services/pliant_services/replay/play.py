@@ -27,7 +27,7 @@ _KEYS_S = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class PlayRequest:
-    """The request of a user.  rate: multiple of the capture speed, 0 for as fast as possible."""
+    """Options of a playback.  rate: multiple of the capture speed, 0 for as fast as possible."""
 
     recording: Path
     rate: float = 1.0

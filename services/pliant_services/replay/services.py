@@ -141,7 +141,7 @@ class Replay:
         return (*process.inputs, *there)
 
     def _frames(self) -> int:
-        """Frames that every recorded input has."""
+        """Numbers of the frames that all recorded inputs have."""
         wanted = {t for p in self._services for t in self._inputs_of(p) if t.per_frame}
         keys = {_recorded_as(topic).key for topic in wanted if topic not in self.made}
         found = self._summary.topics

@@ -128,7 +128,7 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None, held: He
             "allow: leave it out, and use it on the recording"
         )
     if request.force and not dataset.is_live:
-        next(iter(dataset), None)  # what has no first frame costs no earlier result
+        next(iter(dataset), None)  # without a first frame an earlier result stays
     progress = Progress(dataset.frame_count)
     for note in (*notes_on(dataset), *measurements_of(request.source, dataset).notes):
         progress.say(note)

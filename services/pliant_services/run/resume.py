@@ -66,7 +66,7 @@ def has_ended(output: Path, services: Sequence[str], config: Config) -> bool:
 
 def check_ended(output: Path, config: Config) -> None:
     """Raise ResultError where a run without checkpoints was not recorded to its end."""
-    from pliant.results.surfels import has_surfels  # it loads what a launcher has no use for
+    from pliant.results.surfels import has_surfels  # loads modules that a launcher does not need
 
     deformable = has_surfels(output / RECORDING_NAME)
     rigid = "rigid" if config.meshing.enabled else "points"

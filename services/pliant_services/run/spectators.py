@@ -56,7 +56,7 @@ class Viewer:
             *("--connect", fleet.endpoint, "--session", fleet.session, "--patience", str(_WAIT_S)),
             *self._where,
         ]
-        # In a session of its own: Ctrl-C is for the launcher, and it sees the run to its end.
+        # In a session of its own: Ctrl-C is for the launcher, and the viewer shows the whole run.
         self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
         waited = 0.0
         while not fleet.wait_for_viewer(0.2):

@@ -210,7 +210,7 @@ def random_delays(largest_ms: float) -> Callable[[], None] | None:
 
 
 def end_with_launcher() -> None:
-    """Leave when the launcher is gone, whatever killed it: our standard input is its pipe.
+    """Exit when the launcher has ended for any reason: our standard input is its pipe.
 
     Interrupted first, so that a recording is closed; ended three seconds later.
     """

@@ -44,7 +44,7 @@ class MappingPace:
 
     @property
     def counters(self) -> dict[str, float]:
-        """For the status."""
+        """Counts for the status of the service."""
         return {"unmapped": self.unmapped, "unplaced": self.unplaced}
 
     def mark(self, image: Image, waiting: int, limits: IngestParameters) -> Image:

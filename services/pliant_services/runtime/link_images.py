@@ -62,9 +62,9 @@ class Sender:
 
 
 def receive_images(bus: Bus, *, mapped_only: bool = False) -> Iterator[Image]:
-    """Every ``camera/image`` with its pixels, however it came.
+    """Every ``camera/image`` with its pixels, in whatever form it was sent.
 
-    mapped_only: those that bundle adjustment passes over come as they are, perhaps without.
+    mapped_only: images that bundle adjustment skips stay as sent, perhaps without pixels.
     Raises MessageError for one that no sender of ours makes.
     """
     for image in receive(bus, topics.IMAGE, Image):

@@ -40,7 +40,7 @@ class WatchedCanvas(Canvas, Protocol):
 
     @property
     def is_watched(self) -> bool:
-        """Whether it is of use to continue drawing."""
+        """Whether anything is left to draw."""
         ...
 
 

@@ -75,7 +75,7 @@ class Board:
         )
 
     def aruco(self, *, legacy: bool = False) -> Any:
-        """OpenCV's board.  legacy: with a marker at the top left, as before version 4.6."""
+        """Return OpenCV's board.  legacy: with a marker at the top left, as before version 4.6."""
         dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARIES[self.dictionary])
         size = (self.columns, self.rows)
         board: Any = cv2.aruco.CharucoBoard(size, 1.0, self.marker_share, dictionary)
@@ -185,7 +185,7 @@ class BoardCalibration:
 def choose_views(
     views: Sequence[BoardView], sharpness: Sequence[float], board: Board, width: int
 ) -> I64:
-    """Indices of views that differ from each other, of those that do not the sharpest.
+    """Indices of views that differ from each other; of similar ones, the sharpest.
 
     What a view is like is where it has the board's outer corners: that is place, size and tilt.
     width: of the images, px.
@@ -268,7 +268,7 @@ def _solved(
     flags: int,
     start: Lens | None,
 ) -> tuple[_Fit | None, bool]:
-    """The fit, and whether its k3 is more than noise.  None where it does not converge."""
+    """The fit, and whether its k3 is significant.  None if it does not converge."""
     on_board = [np.pad(view.corners, ((0, 0), (0, 1))) for view in views]
     seen = [view.points_px for view in views]
     try:

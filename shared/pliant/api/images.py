@@ -27,7 +27,7 @@ def source_frame(
 ) -> SourceFrame:
     """An image (H, W) grey or (H, W, 3) RGB, uint8, as a frame of a source.
 
-    camera: that took it; None where it is unknown.  mask: (H, W), 0 where it is ignored.  Raises
+    camera: of the image; None if unknown.  mask: (H, W), 0 where it is ignored.  Raises
     DatasetError where it cannot be its.
     """
     image = np.asarray(image)

@@ -60,7 +60,7 @@ class Slam(Mapped):
 
     @property
     def history(self) -> MapHistory:
-        """Of all images until now."""
+        """The map after all images until now."""
         return self._history
 
     def track(

@@ -74,7 +74,7 @@ class Bus(Protocol):
         ...
 
     def end(self, topic: Topic) -> None:
-        """Close a topic: readers leave their loop once they have read what came before."""
+        """Close a topic: readers end after the messages sent before."""
         ...
 
     def restore(self) -> Any | None:

@@ -70,7 +70,7 @@ class InLink:
         self._credit.put(_CREDIT.pack(incarnation, taken, self.safe, ask))
 
     def start_from(self, taken: int) -> None:
-        """Go on behind ``taken`` messages."""
+        """Continue after ``taken`` messages."""
         self.box.start_from(taken)
         self.safe = taken
 

@@ -38,7 +38,7 @@ def service_of(key: str) -> str:
 
 
 def misfit(key: str, reader: str) -> str:
-    """The error for the token of another version than this reader's; "" for one that fits, and for
+    """The error for a token of another version than this reader's; "" if it fits, and for
     none of ours."""
     match = _TOKEN.search(key)
     if match is None:

@@ -199,7 +199,7 @@ class LocalRouter:
             self.session = open_router(self.endpoint)
 
     def close(self) -> None:
-        """Close it, and leave nothing behind.  Raises ZError where a client does not answer."""
+        """Close the session.  Raises ZError if a client does not answer."""
         try:
             self.session.close()  # type: ignore[no-untyped-call]
         finally:

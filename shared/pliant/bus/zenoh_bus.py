@@ -346,7 +346,7 @@ class ZenohBus:
         if self._checkpoints is None:
             return None
         outputs = self._outputs.values()
-        if self._checkpoints.has_any():  # our readers have been here: the wait for them is limited
+        if self._checkpoints.has_any():  # readers were connected once: the wait is limited
             with self._changed:
                 self._peers.expect((r for o in outputs for r in o.box.readers), time.monotonic())
         for output in outputs:

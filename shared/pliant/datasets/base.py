@@ -15,7 +15,7 @@ class BrokenFrame(DatasetError):  # noqa: N818 (an error of one frame, not of th
 
 @dataclass(frozen=True, kw_only=True)
 class SourceFrame:
-    """One frame as it came.
+    """One frame as the source provides it.
 
     index: from 0, without gaps.     stamp_ns: capture time, increasing.
     encoding: how ``data`` is read: a file format ("jpeg", "png", "bmp", "tiff", "webp", "pnm", or

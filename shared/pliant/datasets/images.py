@@ -1,4 +1,4 @@
-"""Sources made of image files: the data set itself, and the checks of its images."""
+"""Sources of image files: the data set, and checks of its images."""
 
 import re
 from collections.abc import Iterator, Sequence

@@ -48,7 +48,7 @@ def recorded_sensors(spec: SourceSpec) -> Measurements:
 
 
 class RecordedFrames:
-    """The frames of a recording.  One that was cut off ends where it was."""
+    """The frames of a recording.  A truncated one ends where it was truncated."""
 
     is_live = False
     ground_truth_path: Path | None = None

@@ -137,7 +137,7 @@ class _RecordedClip:
         self._next = 0
 
     def _unpacked(self, recording: Recording) -> IO[bytes]:
-        """The file, as far as the recording has it; removed after its last reader."""
+        """The part of the file that the recording has; removed after its last reader."""
         file: IO[bytes] | None = None
         there = size = 0
         for item in recording.everything(topics.CLIP):

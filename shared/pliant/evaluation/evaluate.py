@@ -146,7 +146,7 @@ def _check_scan(request: EvaluationRequest) -> None:
 
 
 def _check_outputs(request: EvaluationRequest) -> None:
-    """Raise ResultError where a file would replace what is read, or what is there.
+    """Raise ResultError if a file would replace an input or an existing file.
 
     It may be a new one beside what is read.
     """

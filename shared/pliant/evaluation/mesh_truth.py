@@ -138,7 +138,7 @@ class MeshEvaluation:
         )
 
     def columns(self) -> dict[str, SurfaceFigures]:
-        """The surface as the field compares it; empty where there is none."""
+        """The surface in the form that benchmarks compare; empty without one."""
         surface, diameter = self._true_surface()
         if len(surface) == 0 or len(self.mesh.triangles) == 0:
             return {}

@@ -27,7 +27,7 @@ class TexturedMesh:
 
 
 def write_glb(path: Path, mesh: TexturedMesh) -> None:
-    """Binary glTF 2.0 with the texture inside: equal meshes, equal bytes.  Raises ResultError."""
+    """Write binary glTF with its texture; equal meshes give equal bytes.  Raises ResultError."""
     glb = Glb()
     attributes = {
         "POSITION": glb.vertices(mesh.positions, bounded=True),

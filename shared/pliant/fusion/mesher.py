@@ -389,7 +389,7 @@ class Mesher:
         return depth_map if used is None else depth_map.within(used)
 
     def _correction(self, keyframe: int) -> tuple[float, ...]:
-        """What is left of that with which the segment of a keyframe was made."""
+        """The remaining correction of the calibration with which a keyframe's segment was made."""
         segment = self._map.keyframes[keyframe].segment
         return self._corrections.get(segment, self._left_of(()))
 

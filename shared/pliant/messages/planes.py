@@ -20,7 +20,7 @@ _LEAST_BYTES = 1024  # below that there is nothing to gain
 
 
 def in_planes(message: type, data: bytes) -> bytes:
-    """The bytes of an encoded message, its arrays in planes; as they are where they are none."""
+    """The bytes of an encoded message with its arrays in planes; unchanged without arrays."""
     widths = {a.name: a.dtype.itemsize for a in array_fields(message) if a.dtype.itemsize > 1}
     if not widths or len(data) < _LEAST_BYTES:
         return data

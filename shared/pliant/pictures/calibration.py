@@ -1,4 +1,4 @@
-"""How good a calibration is, as a picture: where the board was seen, and what is left over."""
+"""A picture of a calibration: where the board was seen, and the remaining errors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -217,7 +217,7 @@ def _any_normal(vector: F64) -> F64:
 
 
 def _towards(points: F64, T_world_camera: F64, view: MapView) -> BoolArray:
-    """(P,) points that the eye sees from the side from which the nearest camera has."""
+    """(P,) points that the viewer sees from the same side as the nearest camera."""
     positions = T_world_camera[:: -(-len(T_world_camera) // _STOPS) or 1, :3, 3]
     if not len(positions):
         return np.ones(len(points), bool)

@@ -71,7 +71,7 @@ def folder_name(source: str) -> str:
 
 
 def keep_apart(output: Path, read: Iterable[Path], *, option: str = "--output") -> None:
-    """Raise ResultError where what is written at a path would destroy what a command reads.
+    """Raise ResultError if an output would overwrite an input of the command.
 
     read: files and folders, which may not be the output nor lie in it, by what the paths resolve
     to: links and ``..`` are seen through.  option: that names the output.

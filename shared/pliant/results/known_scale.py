@@ -1,6 +1,6 @@
 """Unit and vertical of a result's map: ``scale.yaml`` in its folder, and readers that apply it.
 
-The recording is unchanged, because a replay compares its bytes.  Lengths for a result are read
+The recording is unchanged, because a replay compares its bytes.  A result gets its lengths
 through ``MetricRecording``.
 """
 

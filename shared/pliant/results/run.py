@@ -122,7 +122,7 @@ class Run:
 
     @property
     def image_ages_ms(self) -> F64:
-        """Of live images, when their poses were published."""
+        """Ages of live images when their poses were published."""
         frames = [frame for frame in self.history.online if frame in self.captured_s]
         ages_s = [self.mapped_s[f] - self.captured_s[f] for f in frames if f in self.mapped_s]
         return 1e3 * np.array(ages_s, np.float64)
@@ -179,7 +179,7 @@ def read_run(path: Path, scale: Scale | None = None) -> Run:
 
 
 def known_keyframes(recording: Recording) -> Iterator[MapKeyframe]:
-    """The map of earlier sessions that a run began with: before all else, as only the messages of
+    """The loaded map with which a run began: read before all else, because only the messages of
     one topic are in order."""
     for keyframe in recording.decoded(topics.MAP_KNOWN):
         assert isinstance(keyframe, MapKeyframe)

@@ -74,7 +74,7 @@ class Canvas(Protocol):
         ...
 
     def forget(self, at: Moment, segment: int) -> None:
-        """A world is over: the map was lost, and the next one has begun."""
+        """A world has ended: the map was lost and another one has begun."""
         ...
 
     def measure(self, at: Moment, name: str, value: float) -> None:

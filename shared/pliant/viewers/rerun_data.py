@@ -60,7 +60,7 @@ class RerunData:
             self._passing_bytes -= len(self._passing.popleft()[1])
 
     def since(self, number: int) -> list[tuple[int, bytes]] | None:
-        """The next parts from this number on, each with its own: no more than a slow browser may
+        """The next parts from this number on, each with its number: no more than a slow browser may
         hold, which are not dropped meanwhile.  Waits for one; None where none comes."""
         with self._changed:
             self._changed.wait_for(lambda: self._is_over or self._parts > number)

@@ -34,7 +34,7 @@ class SceneMesh:
         return self._rank > 0
 
     def begin(self, at: Moment, segment: int) -> None:
-        """A new world, or an earlier one again: what was drawn in the one before goes."""
+        """A new world, or an earlier one again: remove what was drawn in the world before."""
         if segment == self.segment:
             return
         self._clear(at)

@@ -33,7 +33,7 @@ class DepthMap:
     weights: Annotated[F32, Shape("H", "W")]
 
     def within(self, used: BoolArray) -> "DepthMap":
-        """Only where a mask (H, W) says so."""
+        """Return the depth map inside a mask (H, W)."""
         nothing = np.float32(0.0)
         depths, weights = (np.where(used, each, nothing) for each in (self.depths, self.weights))
         return DepthMap(depths=depths, weights=weights)

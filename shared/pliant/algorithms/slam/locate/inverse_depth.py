@@ -67,7 +67,7 @@ def spread_of(points: Landmarks, rows: I32, last: Keyframe) -> Spread:
 
 
 def placed_candidates(points: Landmarks, rows: I32) -> I64:
-    """Indices of the rows, UNLINKED among them, that are candidates with a provisional place."""
+    """Indices of the rows that are candidates with a provisional position; rows may be UNLINKED."""
     return _placed(rows, points.state, points.spread)[0]
 
 
