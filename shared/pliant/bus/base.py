@@ -73,8 +73,11 @@ class Bus(Protocol):
         """
         ...
 
-    def end(self, topic: Topic) -> None:
-        """Close a topic: readers leave their loop once they have read what came before."""
+    def end(self, topic: Topic, *, complete: bool = True) -> None:
+        """Close a topic: readers leave their loop once they have read what came before.
+
+        complete: False where more would have come.
+        """
         ...
 
     def restore(self) -> Any | None:
