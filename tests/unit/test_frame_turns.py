@@ -8,10 +8,10 @@ from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import so3_exp, so3_log
 from pliant.algorithms.inertial.gyro import GyroTurn
+from pliant.algorithms.slam.active.frame_turns import FrameTurns
 from pliant.algorithms.slam.frame import Frame
 from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.slam.parameters import MappingParameters
-from pliant.algorithms.slam.turns import FrameTurns
 from pliant.algorithms.tracks import FrameExtrema
 
 CAMERA = PinholeCamera(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)

@@ -294,7 +294,7 @@ def _start(found: RotationAlignment) -> _Aligned:
 
 @dataclass(frozen=True, kw_only=True)
 class _Prior:
-    """What is known before: the mean, and the information (7, 7) of c, b, o."""
+    """Of the solution: mean, and information (7, 7) of c, b, o."""
 
     R_camera_imu: F64
     bias: F64

@@ -25,6 +25,7 @@ from pliant.algorithms.slam.active.frame_pose import (
     to_global_shutter,
     tracks_to_points,
 )
+from pliant.algorithms.slam.active.frame_turns import FrameTurns
 from pliant.algorithms.slam.active.tracked_pose import pose_by_tracks
 from pliant.algorithms.slam.adjust.carried_frames import carried_poses
 from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment
@@ -56,7 +57,6 @@ from pliant.algorithms.slam.start.initialisation_buffer import (
 )
 from pliant.algorithms.slam.start.start import with_minimum_parallax
 from pliant.algorithms.slam.store.kept_map import known_camera
-from pliant.algorithms.slam.turns import FrameTurns
 from pliant.algorithms.stages import StageTimer, no_stages
 
 _LEAST_LOST = 3
