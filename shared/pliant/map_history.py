@@ -1,5 +1,6 @@
 """Folds map updates into what a run leaves: trajectories, keyframes and points."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.geometry import matrix_to_pose, move_by_similarity, pose_to_matrix
-from pliant.algorithms.map_delta import MapDelta, MapMoves
+from pliant.algorithms.map_delta import BY_GYRO, MapDelta, MapMoves
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.trajectory import Trajectory
 
@@ -255,18 +256,22 @@ class MapHistory(CurrentMap):
 
     def final(self) -> dict[int, tuple[int, F64]]:
         """Segment and T_world_camera of every supported frame, after all corrections."""
+        return self._placed(lambda pose: pose.inliers >= MIN_INLIERS)
+
+    def by_gyro(self) -> dict[int, tuple[int, F64]]:
+        """The same of frames that no image supports, between others."""
+        return self._placed(lambda pose: pose.inliers == BY_GYRO)
+
+    def placed(self) -> dict[int, tuple[int, F64]]:
+        """The same of both."""
+        return self._placed(lambda pose: pose.inliers >= MIN_INLIERS or pose.inliers == BY_GYRO)
+
+    def _placed(self, chosen: Callable[[FramePose], bool]) -> dict[int, tuple[int, F64]]:
         return {
             frame: (pose.segment, matrix_to_pose(self._world(pose)))
-            for frame, pose in self._supported()
-        }
-
-    def _supported(self) -> list[tuple[int, FramePose]]:
-        """Frames whose poses count, in their order."""
-        return [
-            (frame, pose)
             for frame, pose in sorted(self.frames.items(), key=lambda item: item[0])
-            if pose.inliers >= MIN_INLIERS and pose.keyframe in self.keyframes
-        ]
+            if chosen(pose) and pose.keyframe in self.keyframes
+        }
 
     def same_places_in(self, segment: int) -> F64:
         """(L, 2, 3) positions of pairs of keyframes of a segment that show one place."""
@@ -277,8 +282,8 @@ class MapHistory(CurrentMap):
     def longest_segment(self) -> int:
         """The segment with the most supported frames (the earliest of equals); -1 without any."""
         counts: dict[int, int] = {}
-        for _, pose in self._supported():
-            counts[pose.segment] = counts.get(pose.segment, 0) + 1
+        for segment, _ in self.final().values():
+            counts[segment] = counts.get(segment, 0) + 1
         return max(counts, key=counts.__getitem__, default=-1)
 
     def trajectory_in(self, segment: int, poses: dict[int, tuple[int, F64]]) -> Trajectory:

@@ -6,6 +6,9 @@ again and the classes listed here, without a call of their code, and none gets a
 place of a method.  What is shared stays shared; arrays keep their layout, which decides how a
 kernel is compiled.
 
+What never changes and is large, such as the samples of a whole run, may be stored once and named in
+every state: see ``Constants``.
+
 A state is valid only for the release that made it, because it does not describe its objects.
 """
 
@@ -15,7 +18,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cached_property
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import msgpack
 import numpy as np
@@ -24,7 +27,7 @@ from pydantic import BaseModel
 from pliant.errors import StateError
 from pliant.version import __version__
 
-STATE_VERSION = 2
+STATE_VERSION = 3
 
 _ROOMS = (
     *("pliant.algorithms.", "pliant.messages.types"),
@@ -38,14 +41,31 @@ _CLASSES = {
 }
 """Those that are no records: neither dataclasses, nor named tuples, nor parameters."""
 _FUNCTIONS = {"no_stages"}
+_CONSTANT = {"GyroSignal"}
+"""Records that never change: a state names them where there is a store for them."""
 
 _PLAIN = (type(None), bool, float, str, bytes)
 _LIMIT = 1 << 62
 
 
-def save_state(root: Any) -> bytes:
-    """The bytes of an object and all that it holds.  Raises StateError for what cannot be kept."""
-    writer = _Writer()
+class Constants(Protocol):
+    """A store of records that never change, beside the states that name them."""
+
+    def keep(self, record: Any) -> str:
+        """Store a record if it is new; returns its name."""
+        ...
+
+    def kept(self, name: str) -> Any:
+        """The record of this name.  Raises StateError where there is none."""
+        ...
+
+
+def save_state(root: Any, constants: Constants | None = None) -> bytes:
+    """The bytes of an object and all that it holds, but for what goes to ``constants``.
+
+    Raises StateError for what cannot be kept.
+    """
+    writer = _Writer(constants)
     top = writer.reference(root)
     header = [STATE_VERSION, __version__, _schema(writer.classes)]
     packed = msgpack.packb([*header, top, writer.nodes], use_bin_type=True)
@@ -53,9 +73,12 @@ def save_state(root: Any) -> bytes:
     return packed
 
 
-def load_state(data: bytes) -> Any:
+def load_state(data: bytes, constants: Constants | None = None) -> Any:
     """The object in ``data``.  Raises StateError for all that ``save_state`` did not make, also
-    in another release, or when its records had other fields."""
+    in another release, or when its records had other fields.
+
+    constants: those that it was saved with.
+    """
     try:
         version, *content = msgpack.unpackb(data, raw=False, strict_map_key=False)
     except Exception as error:  # msgpack raises many unrelated types on broken bytes
@@ -71,7 +94,7 @@ def load_state(data: bytes) -> Any:
             )
         if schema != _schema(_find(*n[1:3]) for n in nodes if n[0] in ("object", "named", "model")):
             raise StateError("a state with other fields than in this release: start again")
-        return _Reader(nodes).value(top)
+        return _Reader(nodes, constants).value(top)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ImportError) as error:
         raise StateError(f"a broken state: {error}") from None
 
@@ -79,8 +102,9 @@ def load_state(data: bytes) -> Any:
 class _Writer:
     """Numbers every object that it meets; ``nodes`` holds them in that order."""
 
-    def __init__(self) -> None:
+    def __init__(self, constants: Constants | None) -> None:
         self.nodes: list[Any] = []
+        self._constants = constants
         self.classes: set[type] = set()
         self._numbers: dict[int, int] = {}
         self._held: list[Any] = []  # an id is only unique while its object lives
@@ -121,6 +145,8 @@ class _Writer:
             return ["named", *self._class(kind), [self.reference(item) for item in value]]
         if callable(value) and hasattr(value, "__qualname__"):
             return ["name", *_name(value)]
+        if self._constants is not None and kind.__name__ in _CONSTANT:
+            return ["constant", self._constants.keep(value)]
         attributes = {key: self.reference(item) for key, item in _attributes(value).items()}
         return ["object", *self._class(kind), attributes]
 
@@ -130,8 +156,9 @@ class _Writer:
 
 
 class _Reader:
-    def __init__(self, nodes: list[Any]) -> None:
+    def __init__(self, nodes: list[Any], constants: Constants | None) -> None:
         self._nodes = nodes
+        self._constants = constants
         self._made: dict[int, Any] = {}
 
     def value(self, reference: Any) -> Any:
@@ -183,6 +210,8 @@ class _Reader:
             return parameters.model_validate(content[2])
         if kind == "name":
             return _find(*content)
+        if kind == "constant" and self._constants is not None:
+            return self._constants.kept(content[0])
         raise ValueError(f"a node of kind {kind}")
 
 

@@ -73,7 +73,7 @@ def run(dataset: Dataset, covered: range, seed: int, given: ImuSamples | None) -
         pipeline.take(source)
         count += 1
     pipeline.finish()
-    final, longest = history.final(), history.longest_segment()
+    final, longest = history.placed(), history.longest_segment()
     found = history.trajectory_in(longest, final)
     rows, true_rows = associate(found.stamps_ns, truth.stamps_ns)
     scale, R, t = align_umeyama(found.positions[rows], truth.positions[true_rows], with_scale=True)

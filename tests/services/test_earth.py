@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -11,8 +12,8 @@ import pytest
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import align_umeyama, so3_exp
 from pliant.algorithms.inertial.geodesy import EnuOrigin, enu_of, geodetic_of_enu
-from pliant.algorithms.inertial.samples import GpsFixes
-from pliant.algorithms.map_delta import TRACKING
+from pliant.algorithms.inertial.samples import GpsFixes, ImuSamples
+from pliant.algorithms.map_delta import BY_GYRO, TRACKING
 from pliant.algorithms.tracks import FrameTracks
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config
@@ -22,7 +23,7 @@ from pliant.export.export import export_result
 from pliant.formats.tum import read_tum
 from pliant.messages import topics
 from pliant.messages.types import CameraStream, Extrema, Header, MapUpdate
-from pliant.recording.measured import gps_pieces
+from pliant.recording.measured import gps_pieces, imu_pieces
 from pliant.results.known_scale import MetricRecording
 from pliant.results.run import read_run
 from pliant.results.verdict import summary
@@ -60,8 +61,12 @@ def placed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def record(folder: Path, fixes: list[Header]) -> None:
+def record(
+    folder: Path, fixes: list[Header], samples: Sequence[Header] = (), by_gyro: range = range(0)
+) -> None:
+    """by_gyro: frames that no image supports, far from where they were."""
     stamps, enu = path()
+    enu[by_gyro] += 1000.0
     camera = "model: pinhole\nwidth: 160\nheight: 120\nfx: 100\nfy: 100\ncx: 79.5\ncy: 59.5\n"
     stream = CameraStream(
         frame=0, stamp_ns=0, frame_id="", source="", mode="lossless", frames=FRAMES,
@@ -70,10 +75,12 @@ def record(folder: Path, fixes: list[Header]) -> None:
     poses = np.zeros((FRAMES, 7))
     poses[:, :3], poses[:, 6] = enu @ TURN / SCALE, 1.0
     frames, none = np.arange(FRAMES), np.zeros(FRAMES, np.int32)
+    inliers = none + 400
+    inliers[by_gyro] = BY_GYRO
     final = MapUpdate(
         frame=FRAMES - 1, stamp_ns=int(stamps[-1]), frame_id="", state=TRACKING, reason="",
         segment=0, inliers=400, pose_frames=frames, pose_segments=none, pose_keyframes=frames,
-        poses_keyframe_camera=np.tile(np.eye(7)[6], (FRAMES, 1)), pose_inliers=none + 400,
+        poses_keyframe_camera=np.tile(np.eye(7)[6], (FRAMES, 1)), pose_inliers=inliers,
         keyframe_ids=frames, keyframe_frames=frames, keyframe_segments=none, keyframe_poses=poses,
         point_ids=np.zeros(0, np.int64), point_segments=none[:0], points_world=np.zeros((0, 3)),
         point_colours=np.zeros((0, 3), np.uint8), point_keyframes=none[:0],
@@ -90,7 +97,8 @@ def record(folder: Path, fixes: list[Header]) -> None:
         for frame, stamp in enumerate(stamps)
     ]
     told: dict[topics.Topic, list[Header]] = {
-        topics.STREAM: [stream], topics.GPS: fixes, topics.EXTREMA: list(tracks),
+        topics.STREAM: [stream], topics.GPS: fixes, topics.IMU: list(samples),
+        topics.EXTREMA: list(tracks),
         topics.MAP_UPDATE: updates,
         topics.MAP_FINAL: [final],
     }  # fmt: skip
@@ -126,6 +134,41 @@ def test_refused_fixes_do_not_change_a_run(tmp_path: Path) -> None:
     assert report["gps_refusal"]
     assert any(line.startswith("satellite fixes not used: ") for line in summary(report))
     assert not (tmp_path / "scale.yaml").exists()
+
+
+def still_samples() -> list[Header]:
+    """Of a sensor that lies on a table."""
+    stamps = path()[0][0] + 10_000_000 * np.arange(int(STEP_NS * FRAMES / 10_000_000))
+    noise = 1e-3 * np.random.default_rng(0).normal(size=(len(stamps), 3))
+    up = np.array([0.0, 0.0, 9.81])
+    samples = ImuSamples(stamps_ns=stamps, gyro_rad_s=noise, accel_m_s2=noise + up)
+    return list(imu_pieces(samples))
+
+
+def test_the_refusal_of_one_sensor_is_reported_beside_the_scale_of_the_other(
+    tmp_path: Path,
+) -> None:
+    record(tmp_path, list(gps_pieces(fixes_on(*path()))), still_samples())
+    report = write_rigid_results(tmp_path)
+    assert "satellite fixes" in report["scale"]["source"]
+    assert report["inertial_refusal"]
+    assert not report["gps_refusal"]
+    lines = summary(report)
+    assert any(line.startswith("in metres by") for line in lines)
+    assert any(line.startswith("inertial samples not used: ") for line in lines)
+
+
+def test_poses_by_the_gyro_alone_are_no_evidence_and_named(tmp_path: Path) -> None:
+    """They would change the scale: here they are a kilometre off."""
+    lost = range(40, 50)
+    record(tmp_path, list(gps_pieces(fixes_on(*path()))), by_gyro=lost)
+    report = write_rigid_results(tmp_path)
+    assert report["scale"]["metres_per_unit"] == pytest.approx(SCALE, rel=1e-4)
+    assert report["frames_by_gyro"] == list(lost)
+    assert report["frames_with_pose"] == FRAMES - len(lost)
+    assert "10 are placed by the gyro alone" in report["verdict_reason"]
+    assert any("placed by the gyro between others: 40 to 49" in line for line in summary(report))
+    assert len(read_tum(tmp_path / "trajectory.txt")) == FRAMES
 
 
 def test_gpx_is_where_the_camera_was(placed: Path) -> None:

@@ -18,7 +18,7 @@ from pliant.config import Config, IngestParameters
 from pliant.datasets.base import SourceFrame, encoding_of
 from pliant.datasets.calibration import Calibration
 from pliant.datasets.measured.base import Measurements
-from pliant.errors import DatasetError, SourceLostError
+from pliant.errors import BusError, DatasetError, SourceLostError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import CAPTURED, MASKED, CameraStream, Depth, Header, Image, SourceImage
@@ -141,9 +141,9 @@ def test_the_camera_comes_first_and_its_topic_is_closed_before_the_first_frame()
             order.append(topic.key)
             super().publish(topic, message, may_lag=may_lag)
 
-        def end(self, topic: Topic) -> None:
+        def end(self, topic: Topic, *, complete: bool = True) -> None:
             order.append(f"end of {topic.key}")
-            super().end(topic)
+            super().end(topic, complete=complete)
 
     _, _, bus = run(FakeDataset([png(0)]), Bus({}))
     assert order[:2] == [topics.STREAM.key, f"end of {topics.STREAM.key}"]
@@ -351,7 +351,7 @@ class HearingDataset(FakeDataset):
     """Of a live source whose sensor measures once an image."""
 
     def heard(self) -> Measurements:
-        stamps = np.array([frame.stamp_ns for frame in self], np.int64)
+        stamps = STEP_NS * np.arange(len(self.data))
         values = np.ones((len(stamps), 3))
         samples = ImuSamples(stamps_ns=stamps, gyro_rad_s=values, accel_m_s2=values)
         return Measurements(imu=samples)
@@ -368,6 +368,25 @@ def test_what_a_live_source_hears_comes_after_the_last_frame() -> None:
     assert len(imu_in(bus.outputs[topics.IMU]).stamps_ns) == 2
     ended = bus.ended
     assert ended.index(topics.IMAGE) < ended.index(topics.IMU) < ended.index(topics.GPS)
+
+
+def test_what_a_source_that_fails_has_heard_is_sent_as_incomplete() -> None:
+    bus, dataset = ReplayBus({}), HearingDataset([png(i) for i in range(5)], fails_at=3)
+    with pytest.raises(SourceLostError):
+        ingest.run(bus, Config(), Counters(), dataset, lambda: False)
+    assert len(imu_in(bus.outputs[topics.IMU]).stamps_ns) == 5
+    assert set(bus.cut_off) == {topics.IMAGE, topics.IMU, topics.GPS}
+
+
+def test_after_a_fault_of_ours_no_topic_ends() -> None:
+    class Full(ReplayBus):
+        def checkpoint(self, frame: int, state: object) -> None:
+            raise BusError("the disk is full")
+
+    bus = Full({})
+    with pytest.raises(BusError):
+        ingest.run(bus, Config(), Counters(), HearingDataset([png(0)]), lambda: False)
+    assert not {topics.IMAGE, topics.IMU, topics.GPS} & set(bus.ended)
 
 
 def test_without_other_sensors_nothing_more_is_sent() -> None:

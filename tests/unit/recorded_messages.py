@@ -184,3 +184,19 @@ def _foxglove_type(writer: Writer, name: str, encoding: str) -> tuple[int, Calla
         return data
 
     return support.register_schema(writer, getattr(module, name)), make
+
+
+def imu(ros: Ros, index: int, turning: float = 0.5) -> Any:
+    """A sample at the time of an image."""
+    vector = ros.types["geometry_msgs/msg/Vector3"]
+    quaternion = ros.types["geometry_msgs/msg/Quaternion"]
+    unknown = np.array([-1.0, *[0.0] * 8])
+    return ros.types["sensor_msgs/msg/Imu"](
+        header=ros.header(index),
+        orientation=quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=unknown,
+        angular_velocity=vector(x=0.25 * index, y=turning, z=0.0),
+        angular_velocity_covariance=np.zeros(9),
+        linear_acceleration=vector(x=0.0, y=9.5, z=1.0),
+        linear_acceleration_covariance=np.zeros(9),
+    )

@@ -1,12 +1,15 @@
-"""A folder of checkpoints that cannot be made names whose it is."""
+"""A folder of checkpoints: whose it is, and what it stores once."""
 
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from pliant.bus.checkpoints import Checkpoints
-from pliant.errors import BusError
+from pliant.algorithms.inertial.preintegration import GyroSignal
+from pliant.bus.checkpoints import Checkpoints, Place
+from pliant.errors import BusError, StateError
+from pliant.state import load_state, save_state
 
 
 def test_a_folder_of_another_user_names_the_user_to_run_as(
@@ -21,3 +24,42 @@ def test_a_folder_of_another_user_names_the_user_to_run_as(
     says = f"belongs to user {found.st_uid}, this is user .*PLIANT_USER={found.st_uid}:"
     with pytest.raises(BusError, match=says):
         Checkpoints(tmp_path / "session" / "state", interval=1)
+
+
+def signal() -> GyroSignal:
+    return GyroSignal(times_s=np.arange(1000.0), gyro=np.ones((1000, 3)))
+
+
+def saved(folder: Path, store: Checkpoints, frame: int, state: object) -> int:
+    """Keep a state as a service does; returns the bytes of its file."""
+    store.save(Place(frame, {}, {}), save_state(state, store), lambda: None)
+    store.close()
+    return (folder / f"{frame:09d}.state").stat().st_size
+
+
+def test_what_never_changes_is_written_once_and_comes_back(tmp_path: Path) -> None:
+    store, kept = Checkpoints(tmp_path, interval=1), signal()
+    state = {"now": 1, "signal": kept, "again": kept}
+    sizes = [saved(tmp_path, store, frame, state | {"now": frame}) for frame in range(3)]
+    assert max(sizes) < 1000 < kept.gyro.nbytes
+    assert len(list(tmp_path.glob("*.constant"))) == 1
+    restarted = Checkpoints(tmp_path, interval=1)
+    place = restarted.usable({})
+    assert place is not None
+    found = load_state(restarted.restart_from(place), restarted)
+    assert found["now"] == 2
+    assert found["signal"] is found["again"]
+    np.testing.assert_array_equal(found["signal"].gyro, kept.gyro)
+    saved(tmp_path, restarted, 3, found)
+    assert len(list(tmp_path.glob("*.constant"))) == 1
+
+
+def test_a_state_whose_constant_is_gone_is_one_error(tmp_path: Path) -> None:
+    store = Checkpoints(tmp_path, interval=1)
+    data = save_state([signal()], store)
+    (constant,) = tmp_path.glob("*.constant")
+    constant.unlink()
+    with pytest.raises(BusError, match="cannot read the checkpoint"):
+        load_state(data, Checkpoints(tmp_path, interval=1))
+    with pytest.raises(StateError, match="broken state"):
+        load_state(data)

@@ -12,6 +12,7 @@ from recorded_messages import (
     STEP_NS,
     Messages,
     Ros,
+    imu,
     usual,
     write_ros1_bag,
     write_ros2_bag,
@@ -30,21 +31,6 @@ KINDS = [
     pytest.param("a", 2, write_ros2_bag, id="ros2"),
     pytest.param("a.mcap", 2, write_ros_mcap, id="mcap"),
 ]
-
-
-def imu(ros: Ros, index: int, turning: float = 0.5) -> Any:
-    vector = ros.types["geometry_msgs/msg/Vector3"]
-    quaternion = ros.types["geometry_msgs/msg/Quaternion"]
-    unknown = np.array([-1.0, *[0.0] * 8])
-    return ros.types["sensor_msgs/msg/Imu"](
-        header=ros.header(index),
-        orientation=quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
-        orientation_covariance=unknown,
-        angular_velocity=vector(x=0.25 * index, y=turning, z=0.0),
-        angular_velocity_covariance=np.zeros(9),
-        linear_acceleration=vector(x=0.0, y=9.5, z=1.0),
-        linear_acceleration_covariance=np.zeros(9),
-    )
 
 
 def fix(ros: Ros, index: int, status: int = 0) -> Any:

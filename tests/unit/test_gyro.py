@@ -114,7 +114,66 @@ def test_a_gyro_that_stops_to_fit_is_dropped() -> None:
     shown(gyro, motion.stamps_ns.tolist(), seen(motion))
     assert gyro.is_believed
     assert gyro.dropped
+    assert len(gyro.signal.times_s) == 2
     assert gyro.turn(int(motion.stamps_ns[150]), int(motion.stamps_ns[151])) is None
+
+
+def test_turns_are_forgotten_after_two_minutes() -> None:
+    motion = hand_held(20.0)
+    gyro = gyro_of(samples(motion))
+    turn, step_ns = np.eye(3), 50_000_000
+    for number in range(3000):
+        gyro.see(
+            motion.origin_ns + number * step_ns, motion.origin_ns + (number + 1) * step_ns, turn
+        )
+        assert len(gyro._times_s) == len(gyro._turns) + 1 <= 2402
+    assert not gyro.given_up
+
+
+def test_a_gyro_that_explains_nothing_is_given_up_and_keeps_no_samples() -> None:
+    motion = hand_held(600.0)
+    gyro = gyro_of(turned_back(samples(motion)))
+    shown(gyro, motion.stamps_ns.tolist(), seen(motion))
+    assert gyro.given_up
+    assert not gyro.is_believed
+    assert len(gyro.signal.times_s) == 2
+    assert not gyro._turns
+
+
+def test_an_estimate_before_a_loss_is_the_prior_of_the_next() -> None:
+    """What a minute of turns has shown is not replaced by what 4 s show."""
+    motion = hand_held(70.0)
+    stamps, R = motion.stamps_ns.tolist(), seen(motion)
+    gyro = gyro_of(samples(motion))
+    shown(gyro, stamps[:1180], R[:1180])
+    assert gyro.is_believed
+    before = gyro._aligned
+    gyro.lose()
+    shown(gyro, stamps[1200:1280], R[1200:1280])
+    after = gyro._aligned
+    assert before is not None
+    assert after is not None
+    assert after.at_s > before.at_s + 5.0
+    sigmas = [np.sqrt(np.diag(each.covariance)) for each in (before, after)]
+    assert np.all(sigmas[1][:6] < 1.5 * sigmas[0][:6])
+    apart = so3_log(after.R_camera_imu @ before.R_camera_imu.T)
+    assert np.all(np.abs(apart) < 3.0 * sigmas[0][:3])
+    assert np.linalg.norm(so3_log(after.R_camera_imu.T @ MOUNTED)) < 0.004
+
+
+def test_unsure_images_do_not_contradict() -> None:
+    """Of frames that show little, rotations are as wrong as their variance says."""
+    motion = hand_held(30.0)
+    stamps, R = motion.stamps_ns.tolist(), seen(motion)
+    blurred = R @ so3_exp(0.3 * np.random.default_rng(5).normal(size=(len(R), 3)))
+    for variance, dropped in ((2.0 * 0.3**2, False), (0.0, True)):
+        gyro = gyro_of(samples(motion))
+        shown(gyro, stamps[:300], R[:300])
+        assert gyro.is_believed
+        for now in range(300, 400):
+            turn = blurred[now - 1].T @ blurred[now]
+            gyro.see(stamps[now - 1], stamps[now], turn, variance)
+        assert gyro.dropped == dropped
 
 
 def test_a_gap_in_the_samples_has_no_turn() -> None:

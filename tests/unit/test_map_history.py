@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from pliant.algorithms.geometry import matrix_to_pose, pose_to_matrix, so3_exp
-from pliant.algorithms.map_delta import TRACKING, WAITING, MapDelta
+from pliant.algorithms.map_delta import BY_GYRO, TRACKING, WAITING, MapDelta
 from pliant.map_history import MapHistory
 
 IDENTITY = np.array([0.0, 0, 0, 0, 0, 0, 1])
@@ -95,6 +95,16 @@ def test_a_pose_without_support_does_not_count() -> None:
     history.apply(posed(1, IDENTITY, inliers=29), frame=1, stamp_ns=1)
     assert list(history.final()) == [0]
     assert list(history.online) == [0]
+
+
+def test_a_pose_by_the_gyro_is_placed_but_no_evidence() -> None:
+    history = MapHistory()
+    history.apply(keyframe(posed(0, IDENTITY), IDENTITY), frame=0, stamp_ns=0)
+    history.apply(posed(1, IDENTITY, inliers=BY_GYRO), frame=1, stamp_ns=1)
+    history.apply(posed(2, IDENTITY, inliers=0), frame=2, stamp_ns=2)
+    assert list(history.final()) == [0]
+    assert list(history.by_gyro()) == [1]
+    assert list(history.placed()) == [0, 1]
 
 
 def test_the_longest_segment_has_the_most_supported_frames() -> None:

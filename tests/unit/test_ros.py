@@ -15,6 +15,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.bus.session import open_session
 from pliant.datasets import decode, open_source
+from pliant.datasets.ros_camera import RosCamera
 from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import CalibrationError, DatasetError
 from pliant.viewers.canvas import Moment
@@ -120,12 +121,15 @@ def test_the_domain_is_that_of_ros(monkeypatch: pytest.MonkeyPatch) -> None:
             domain_id()
 
 
-def wait_until_published(endpoint: str, *names: str) -> None:
-    """Until a router knows of topics: those who publish have said so, but not yet been heard."""
+def wait_until_published(endpoint: str, *names: str, gone: bool = False) -> None:
+    """Until a router knows of topics: those who publish have said so, but not yet been heard.
+
+    gone: until it knows that they are no longer published."""
     with open_session([endpoint]) as session:
         node, pause = Node(session, "/watch"), threading.Event()
         for _ in range(int(PATIENCE_S / 0.02)):
-            if set(names) <= {topic.name for topic in node.published()}:
+            published = {topic.name for topic in node.published()}
+            if not set(names) & published if gone else set(names) <= published:
                 return
             pause.wait(0.02)
     raise AssertionError(f"{names} did not come")
@@ -264,6 +268,36 @@ def test_a_camera_of_ros_is_a_source(ros: tuple[str, Node]) -> None:
     for frame in frames:
         number = (frame.stamp_ns - bags.START_NS) // bags.STEP_NS
         np.testing.assert_array_equal(decode(frame), bags.picture(number))
+
+
+@pytest.mark.parametrize("ends", [False, True])
+def test_sensors_are_heard_while_images_come(ros: tuple[str, Node], ends: bool) -> None:
+    """A topic that has ended between the opening of the source and its images is left out."""
+    endpoint, node = ros
+    messages, driver = bags.Ros(2), Driver(endpoint, node)
+    try:
+        with open_session([endpoint]) as session:
+            sensor = Node(session, "/sensor").publisher(RosTopic.of("/imu", "sensor_msgs/msg/Imu"))
+            wait_until_published(endpoint, "/imu")
+            source = open_source("ros:" + endpoint.removeprefix("tcp/"))
+            assert isinstance(source, RosCamera)
+            if ends:
+                session.close()
+                wait_until_published(endpoint, "/imu", gone=True)
+            frames = iter(source)
+            for number in range(3):
+                next(frames)
+                if not ends:
+                    sensor.put(serialised_of(messages, bags.imu(messages, number)))
+            for _ in range(int(PATIENCE_S / 0.02)):
+                if ends or len(source._heard.came["/imu"]) == 3:
+                    break
+                next(frames)
+            came, heard = source._heard.came["/imu"], source.heard().imu
+    finally:
+        driver.stop()
+    assert len(heard.stamps_ns) == (0 if ends else 3)
+    assert all(isinstance(data, bytes) for _, _, data in came)
 
 
 def test_it_ends_without_publishers(endpoint: str) -> None:

@@ -125,21 +125,26 @@ def run(
             raise
         counters |= drops.counters
         monitor.report(image, note=str(error), **counters)
+        _publish_heard(bus, heard, complete=False)
         raise SourceLostError(str(error)) from None
-    finally:
-        if heard is not None:
-            bus.end(topics.IMAGE)  # its readers read what follows once it has ended
-            _publish(bus, heard())
+    _publish_heard(bus, heard, complete=not stopping())
 
 
-def _publish(bus: Bus, measured: Measurements) -> None:
+def _publish(bus: Bus, measured: Measurements, *, complete: bool = True) -> None:
     """All that other sensors measured."""
     for samples in imu_pieces(measured.imu):
         bus.publish(topics.IMU, samples)
-    bus.end(topics.IMU)
+    bus.end(topics.IMU, complete=complete)
     for fixes in gps_pieces(measured.gps):
         bus.publish(topics.GPS, fixes)
-    bus.end(topics.GPS)
+    bus.end(topics.GPS, complete=complete)
+
+
+def _publish_heard(bus: Bus, heard: Callable[[], Measurements] | None, *, complete: bool) -> None:
+    """What other sensors of a live source have measured meanwhile."""
+    if heard is not None:
+        bus.end(topics.IMAGE, complete=complete)  # its readers read what follows once it has ended
+        _publish(bus, heard(), complete=complete)
 
 
 def plays_live(dataset: Dataset, config: Config) -> bool:

@@ -114,8 +114,9 @@ def _leave(state: Path | None, name: str) -> None:
     folder = state / name
     make_folder(folder)
     mark(folder / _MARK)
-    for checkpoint in folder.glob("*.state"):
-        checkpoint.unlink(missing_ok=True)
+    for kind in ("*.state", "*.constant"):
+        for checkpoint in folder.glob(kind):
+            checkpoint.unlink(missing_ok=True)
 
 
 def _check_recording(output: Path, state: Path | None) -> None:

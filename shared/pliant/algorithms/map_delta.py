@@ -17,6 +17,9 @@ from pliant.algorithms.geometry import (
 WAITING, TRACKING, LOST = 0, 1, 2
 """State of the map after a frame: not started, localised, or lost."""
 
+BY_GYRO = -1
+"""Instead of the number of points that support a pose: the gyro places it, between others."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class MapMoves:
@@ -67,7 +70,7 @@ class MapDelta:
     pose_frames: frames whose pose is new or changed; includes this frame when it is localised.
     pose_segments, pose_keyframes: the segment and the reference keyframe of each.
     poses_keyframe_camera: T_keyframe_camera for each.
-    pose_inliers: points that support each.
+    pose_inliers: points that support each; BY_GYRO where no image does.
     keyframe_ids, keyframe_frames, keyframe_segments: keyframes that are new or have moved; frame -1
         for those that an earlier session made.
     keyframe_poses: T_world_camera for each.

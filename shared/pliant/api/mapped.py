@@ -23,7 +23,7 @@ class Mapped(ABC):
     @property
     def trajectory(self) -> Trajectory:
         """Poses after all corrections, one for each frame that has one."""
-        return self.history.trajectory_in(self.history.longest_segment(), self.history.final())
+        return self.history.trajectory_in(self.history.longest_segment(), self.history.placed())
 
     @property
     def online_trajectory(self) -> Trajectory:

@@ -73,8 +73,11 @@ class Bus(Protocol):
         """
         ...
 
-    def end(self, topic: Topic) -> None:
-        """Close a topic: readers end after the messages sent before."""
+    def end(self, topic: Topic, *, complete: bool = True) -> None:
+        """Close a topic: readers end after the messages sent before.
+
+        complete: False where more would have come.
+        """
         ...
 
     def restore(self) -> Any | None:

@@ -3,8 +3,12 @@
 A checkpoint is usable only if no reader can request a message from before it, because the service
 will not make those again.  So several are kept, until an older one can never be needed: the newest
 whose outputs every reader has safe.
+
+Large records that never change are files of their own, which all checkpoints name: see
+``state.Constants``.
 """
 
+import hashlib
 import io
 import os
 import threading
@@ -18,6 +22,7 @@ import msgpack
 
 from pliant.errors import BusError, StateError
 from pliant.files import create, make_folder, put_in_place
+from pliant.state import load_state, save_state
 
 _VERSION = 1
 
@@ -46,6 +51,7 @@ class Checkpoints:
         self._lock = threading.Lock()
         self._writer: threading.Thread | None = None
         self._failure: OSError | None = None
+        self._constants: dict[str, Any] = {}
         try:
             make_folder(folder)
             for unfinished in folder.glob("*.part"):
@@ -115,10 +121,39 @@ class Checkpoints:
                     self._path(frame).unlink()
         return _unpack(self._path(place.frame))[1]
 
+    def keep(self, record: Any) -> str:
+        """Store a record that never changes, the first time; returns its name.  Raises BusError."""
+        for name, known in self._constants.items():
+            if known is record:
+                return name
+        data = save_state(record)
+        name = hashlib.sha256(data).hexdigest()
+        try:
+            _write_whole(self._constant(name), (data,))
+        except OSError as error:
+            raise BusError(f"{self._folder}: cannot write checkpoints: {error}") from None
+        self._constants[name] = record
+        return name
+
+    def kept(self, name: str) -> Any:
+        """The record that a checkpoint names.  Raises BusError and StateError."""
+        if not name.isalnum():
+            raise StateError(f"{self._folder}: not a name of a record: {name!r}")
+        if name not in self._constants:
+            path = self._constant(name)
+            try:
+                self._constants[name] = load_state(path.read_bytes())
+            except OSError as error:
+                raise BusError(f"{path}: cannot read the checkpoint: {error.strerror}") from None
+        return self._constants[name]
+
     def close(self) -> None:
         """Wait for the one that is being written."""
         if self._writer is not None:
             self._writer.join()
+
+    def _constant(self, name: str) -> Path:
+        return self._folder / f"{name}.constant"
 
     def _path(self, frame: int) -> Path:
         return self._folder / f"{frame:09d}.state"

@@ -29,6 +29,8 @@ class ReplayBus:
         self._on_publish = on_publish
         self.outputs: dict[Topic, list[Header]] = {}
         self.ended: list[Topic] = []
+        self.cut_off: list[Topic] = []
+        """Those of them that were not complete."""
         self.acknowledged = self._given = 0
         """Messages that ``receive_any`` gave and ``acknowledge`` vouched for."""
         self.waited_s: Mapping[str, float] = {}
@@ -92,9 +94,11 @@ class ReplayBus:
             return
         self.outputs.setdefault(topic, []).append(self._wire(topic, message))
 
-    def end(self, topic: Topic) -> None:
+    def end(self, topic: Topic, *, complete: bool = True) -> None:
         """Note that the topic was closed."""
         self.ended.append(topic)
+        if not complete:
+            self.cut_off.append(topic)
 
     def restore(self) -> Any | None:
         """Nothing: a replay begins at its beginning."""

@@ -355,7 +355,7 @@ class ZenohBus:
             place = self._checkpoints.usable({o.topic.key: o.box.safe() for o in outputs})
         state = None
         if place is not None:
-            state = load_state(self._checkpoints.restart_from(place))
+            state = load_state(self._checkpoints.restart_from(place), self._checkpoints)
             self._start_from(place)
         self._keeper.begin()
         return state
@@ -376,7 +376,7 @@ class ZenohBus:
             outputs = {key: output.box.sent for key, output in self._outputs.items()}
             ended = tuple(key for key, output in self._outputs.items() if output.ended)
         place = Place(frame, inputs, outputs, ended)
-        self._checkpoints.save(place, save_state(state), self._wake.set)
+        self._checkpoints.save(place, save_state(state, self._checkpoints), self._wake.set)
 
     def _start_from(self, place: Place) -> None:
         with self._changed:

@@ -66,12 +66,13 @@ class RosCamera(MessageImages):
 
 
 class _Heard:
-    """Messages of sensors as they have come, as a file of messages."""
+    """Messages of sensors as they have come, as a file of messages: decoded they are ten times as
+    large."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.topics: list[MessageTopic] = []
-        self.came: dict[str, list[RecordedImage]] = {}
+        self.came: dict[str, list[tuple[int, str, bytes]]] = {}
 
     @contextmanager
     def open(self) -> Generator["_Heard"]:
@@ -79,7 +80,8 @@ class _Heard:
 
     def messages(self, topic: MessageTopic) -> Iterator[RecordedImage]:
         """The messages of a topic so far."""
-        yield from list(self.came.get(topic.name, ()))
+        for arrived_ns, kind, data in list(self.came.get(topic.name, ())):
+            yield recorded_image(arrived_ns, partial(_decoded, kind), data)
 
 
 class _Graph:
@@ -123,7 +125,8 @@ class _OpenGraph:
         self._heard.came = {each.name: [] for each in self._heard.topics}
         subscribers = [self._node.subscribe(ros, take)]
         for each in self._heard.topics:
-            subscribers.append(self._listen(self._published[each.name]))
+            if each.name in self._published:  # else it has ended since
+                subscribers.append(self._listen(self._published[each.name]))
         deadline, last_ns = time.monotonic() + _FIRST_S, -1
         try:
             while True:
@@ -150,7 +153,7 @@ class _OpenGraph:
         came = self._heard.came[ros.name]
 
         def take(data: bytes) -> None:
-            came.append(recorded_image(time.time_ns(), partial(_decoded, ros.kind), data))
+            came.append((time.time_ns(), ros.kind, data))
 
         return self._node.subscribe(ros, take)
 

@@ -293,7 +293,7 @@ def _final_poses(recording: Recording) -> Trajectory:
         return surfel_trajectory(recording.path)
     history = read_run(recording.path).history
     longest = history.longest_segment()
-    return history.trajectory({f: p for f, p in history.final().items() if p[0] == longest})
+    return history.trajectory_in(longest, history.placed())
 
 
 def _frames_per_second(recording: Recording, topic: Topic = topics.EXTREMA) -> float:

@@ -33,13 +33,14 @@ def doubtful_frames(history: MapHistory) -> list[int]:
 
 def judge(
     *, frames: int, in_segments: list[int], doubtful: int, broken: int = 0, absent: int = 0,
-    behind: int = 0, calibration: str = "", focal: str = "", failed: bool = False,
+    behind: int = 0, by_gyro: int = 0, calibration: str = "", focal: str = "", failed: bool = False,
 ) -> tuple[str, str]:  # fmt: skip
     """Return good, doubtful or bad, and the reasons.
 
     frames: all, except those that a mask covers.   in_segments: poses in each segment of the map.
     doubtful: poses with that flag.   broken: frames that do not decode or have a wrong time.
     absent: frames of the source that never came.   behind: frames without a pose for lack of time.
+    by_gyro: frames that no image places, but the gyro between others.
     calibration: why it bends the map; "" if it does not.   focal: how the focal length changes
     during the clip; "" if it does not.   failed: the source broke off.
 
@@ -52,6 +53,7 @@ def judge(
     share = longest / of_source
     which = "frames of the source" if broken or absent else "frames"
     told = f"{share:.0%} of the {which} have a pose in the largest segment"
+    told += f", {by_gyro} are placed by the gyro alone" if by_gyro else ""
     if longest < _LITTLE * (of_source - behind):
         return BAD, told
     if share < _WHOLE and 2 * behind > of_source - longest:

@@ -41,8 +41,8 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
     silent = {*run.missing, *run.passed_over}
     shown = [reason for frame, reason in reasons.items() if frame not in silent]
     shown = shown or list(reasons.values())
-    doubtful = doubtful_frames(history)
-    passed_over = [frame for frame in run.passed_over if frame not in final]
+    doubtful, by_gyro = doubtful_frames(history), sorted(history.by_gyro())
+    passed_over = [frame for frame in run.passed_over if frame not in {*final, *by_gyro}]
     missing = [*run.missing.values()]
     word, why = judge(
         frames=frames - missing.count(MASKED),
@@ -52,6 +52,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         behind=missing.count(DROPPED) + len(passed_over),
         in_segments=[len(members) for members in by_segment.values()],
         doubtful=len(doubtful),
+        by_gyro=len(by_gyro),
         calibration=calibration_doubt(run, final),
         focal=focal_changes(run),
     )
@@ -66,6 +67,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "frames": frames,
         "frames_that_never_came": absent_frames(run, frames),
         "frames_with_pose": len(final),
+        "frames_by_gyro": by_gyro,
         "frames_per_second": round(run.frames_per_second, 2),
         "image_age_ms": _image_age(run),
         "success_rate": len(final) / frames if frames else 0.0,

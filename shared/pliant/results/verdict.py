@@ -11,7 +11,7 @@ from pliant.results.report import broken_images
 from pliant.results.surfels import surfel_summary
 from pliant.wording import counted
 
-_NAMED = 10  # broken images beside the first
+_NAMED = 10  # broken images beside the first, and stretches placed by the gyro
 _OF_SOURCE = re.compile(r"frame (\d+) of the source: ")
 
 
@@ -50,7 +50,7 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
         for mesh in report["mesh"]
         if mesh["level"] == "fine"
     ]
-    lines += _told_by_gyro(report.get("counters", {}).get("bundle_adjustment", {}))
+    lines += _told_by_gyro(report)
     lines += _scale_lines(report)
     lens = report.get("calibration_verdict")
     lines += [lens] if lens and lens != report["verdict_reason"] else []
@@ -93,27 +93,36 @@ def _told_of_map(report: dict[str, Any]) -> list[str]:
 
 
 def _scale_lines(report: dict[str, Any]) -> list[str]:
-    """The measured unit, or why other sensors were not used."""
-    scale = report.get("scale")
+    """The measured unit, and why other sensors were not used."""
+    lines, scale = list[str](), report.get("scale")
     if scale is not None:
         level = scale.get("level")
         up = "" if level is None else f", z is up (+- {level['sigma_deg']:.2f} degrees)"
-        return [f"in metres by {scale['source']}: scale +- {scale['sigma']:.1%}{up}"]
+        lines = [f"in metres by {scale['source']}: scale +- {scale['sigma']:.1%}{up}"]
     sensors = {"inertial samples": "inertial_refusal", "satellite fixes": "gps_refusal"}
     refusals = {sensor: report.get(key) for sensor, key in sensors.items()}
-    return [f"{sensor} not used: {why}" for sensor, why in refusals.items() if why]
+    return lines + [f"{sensor} not used: {why}" for sensor, why in refusals.items() if why]
 
 
-def _told_by_gyro(counters: Mapping[str, float]) -> list[str]:
+def _told_by_gyro(report: dict[str, Any]) -> list[str]:
     """What the gyro has done for the poses, where that is worth a line."""
-    frames, carried = (int(counters.get(f"gyro_{name}", 0)) for name in ("frames", "carried"))
-    lines: list[str] = []
+    counters = report.get("counters", {}).get("bundle_adjustment", {})
+    carried, lines = report.get("frames_by_gyro", []), list[str]()
     if carried:
-        lines.append(f"{counted(carried, 'frame')} between others placed by the gyro")
-    if counters.get("gyro_dropped"):
+        runs = list[list[int]]()
+        for frame in carried:
+            if not runs or runs[-1][-1] + 1 != frame:
+                runs.append([frame])
+            runs[-1].append(frame)
+        named = [f"{run[0]} to {run[-1]}" if run[-1] > run[0] else str(run[0]) for run in runs]
+        more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
         lines.append(
-            f"gyro not used after {counted(frames, 'frame')} with it: it contradicts the images"
+            f"{counted(len(carried), 'frame')} without a pose by images, placed by the gyro "
+            f"between others: {', '.join(named[:_NAMED])}{more}"
         )
+    if counters.get("gyro_dropped"):
+        used = counted(int(counters.get("gyro_frames", 0)), "frame")
+        lines.append(f"gyro not used after {used} with it: it contradicts the images")
     return lines
 
 

@@ -49,7 +49,10 @@ def write_rigid_results(output: Path, scale: Scale | None = None) -> dict[str, A
     run = read_run(recording.path, scale)
     found = None if run.scale_is_metric else by_sensors(recording, run)
     if found is not None:
-        return write_rigid_results(output, found)
+        refusals = run.inertial_refusal, run.gps_refusal
+        scale, recording = found, MetricRecording(output / RECORDING_NAME, found)
+        run = read_run(recording.path, found)
+        run.inertial_refusal, run.gps_refusal = refusals
     final = run.history.final()
     # The longest parts, on other cores.  They write nothing: an interruption waits for them.
     with ThreadPoolExecutor() as others, all_or_none(output) as folder:
@@ -84,7 +87,7 @@ def _write_map(folder: Path, recording: Recording, run: Run) -> None:
 def _write_files(folder: Path, run: Run, final: dict[int, Any], report: dict[str, Any]) -> None:
     history = run.history
     trajectories = {
-        "trajectory": final,
+        "trajectory": history.placed(),
         "trajectory_online": history.online,
         "keyframes": history.keyframe_poses(),
     }

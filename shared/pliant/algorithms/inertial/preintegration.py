@@ -19,7 +19,7 @@ from typing import Annotated
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, BoolArray, Shape
+from pliant.algorithms.arrays import F64, I64, BoolArray, Shape
 from pliant.algorithms.geometry import hat, so3_exp
 
 _SHORTEST_S = 1e-9
@@ -27,25 +27,35 @@ _SHORTEST_S = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImuSignal:
-    """Samples with their times as numbers.
+class GyroSignal:
+    """Angular velocities with their times as numbers.
 
-    times_s: (N,) ascending, of the sensor's clock.  gyro, accel: (N, 3) rad/s and m/s^2.
+    times_s: (N,) ascending, of the sensor's clock.  gyro: (N, 3) rad/s.
     """
 
     times_s: F64
     gyro: F64
-    accel: F64
 
-    def at(self, times_s: F64) -> tuple[F64, F64]:
-        """Angular velocity and specific force (..., 3) at times (...), interpolated."""
+    def rates(self, times_s: F64) -> F64:
+        """Angular velocity (..., 3) at times (...), interpolated."""
+        before, part = self._places(times_s)
+        return (1.0 - part) * self.gyro[before] + part * self.gyro[before + 1]
+
+    def between(self, start_s: float, end_s: float) -> "GyroSignal":
+        """The samples of an interval, and one more at each end: two at least."""
+        first = int(np.searchsorted(self.times_s, start_s, side="right")) - 1
+        last = int(np.searchsorted(self.times_s, end_s, side="left")) + 1
+        first = max(min(first, len(self.times_s) - 2), 0)
+        rows = slice(first, max(last, first + 2))
+        return GyroSignal(times_s=self.times_s[rows], gyro=self.gyro[rows])
+
+    def _places(self, times_s: F64) -> tuple[I64, F64]:
+        """The sample before each time (...), and the part of the step to the next (..., 1)."""
         last = len(self.times_s) - 1
         after = np.clip(np.searchsorted(self.times_s, times_s, side="right"), 1, last)
         before = after - 1
         part = (times_s - self.times_s[before]) / (self.times_s[after] - self.times_s[before])
-        part = np.clip(part, 0.0, 1.0)[..., None]
-        gyro = (1.0 - part) * self.gyro[before] + part * self.gyro[after]
-        return gyro, (1.0 - part) * self.accel[before] + part * self.accel[after]
+        return before, np.clip(part, 0.0, 1.0)[..., None]
 
     def covers(self, starts_s: F64, ends_s: F64, longest_gap_s: float) -> BoolArray:
         """Whether samples no farther apart than ``longest_gap_s`` enclose each interval (K,)."""
@@ -55,6 +65,19 @@ class ImuSignal:
         inside = (first >= 0) & (last < len(self.times_s))
         first, last = np.maximum(first, 0), np.minimum(last, len(self.times_s) - 1)
         return inside & (wide[first] == wide[last])
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuSignal(GyroSignal):
+    """With specific forces.  accel: (N, 3) m/s^2."""
+
+    accel: F64
+
+    def at(self, times_s: F64) -> tuple[F64, F64]:
+        """Angular velocity and specific force (..., 3) at times (...), interpolated."""
+        before, part = self._places(times_s)
+        accel = (1.0 - part) * self.accel[before] + part * self.accel[before + 1]
+        return self.rates(times_s), accel
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from pliant.algorithms.arrays import F64, BoolArray
 from pliant.algorithms.geometry import so3_exp, so3_log
-from pliant.algorithms.inertial.preintegration import ImuSignal
+from pliant.algorithms.inertial.preintegration import GyroSignal
 
 _STEP_S = 0.02
 AVERAGED_S = 0.2
@@ -80,7 +80,7 @@ class Rates:
 
 
 def align_rotation(
-    times_s: F64, turns: F64, signal: ImuSignal, gap_s: float
+    times_s: F64, turns: F64, signal: GyroSignal, gap_s: float
 ) -> RotationAlignment | None:
     """From poses at times (N,), and the turns (N - 1, 3) from each to the next.  None if no offset
     leaves enough overlap."""
@@ -90,6 +90,10 @@ def align_rotation(
     if coarse is None:
         return None
     best: RotationAlignment | None = None
+    around_s = 3.0 * _STEP_S + AVERAGED_S
+    signal = signal.between(
+        float(times_s[0]) + coarse - around_s, float(times_s[-1]) + coarse + around_s
+    )
     for offset in coarse + np.arange(-2.0 * _STEP_S, 2.0 * _STEP_S, _FINE_S):
         found = _wahba(camera, gyro_rates(signal, gap_s, camera.first_s + offset), offset)
         if found is not None and (best is None or found.correlation > best.correlation):
@@ -118,7 +122,7 @@ def turns_of(R_world_camera: F64) -> F64:
     return so3_log(R_world_camera[:-1].swapaxes(1, 2) @ R_world_camera[1:])
 
 
-def longest_gap_s(signal: ImuSignal) -> float:
+def longest_gap_s(signal: GyroSignal) -> float:
     """Between two samples, beyond which some are missing."""
     return _LONGEST_GAP * float(np.median(np.diff(signal.times_s)))
 
@@ -129,7 +133,7 @@ def camera_rates(times_s: F64, turns: F64) -> Rates:
     return _averaged(times_s, angles, np.diff(times_s) <= _LONGEST_STEP_S, float(times_s[0]))
 
 
-def gyro_rates(signal: ImuSignal, gap_s: float, first_s: float) -> Rates:
+def gyro_rates(signal: GyroSignal, gap_s: float, first_s: float) -> Rates:
     """Of the gyro, from a time of its clock on."""
     steps = np.diff(signal.times_s)
     turns = 0.5 * (signal.gyro[1:] + signal.gyro[:-1]) * steps[:, None]

@@ -13,7 +13,6 @@ import numpy as np
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.image.exposure import flaw_of
-from pliant.algorithms.inertial.gyro import Gyro
 from pliant.algorithms.inertial.samples import ImuSamples
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.slam.active.active_map import ActiveMap
@@ -26,6 +25,7 @@ from pliant.algorithms.slam.active.frame_pose import (
     to_global_shutter,
     tracks_to_points,
 )
+from pliant.algorithms.slam.active.frame_turns import FrameTurns
 from pliant.algorithms.slam.active.tracked_pose import pose_by_tracks
 from pliant.algorithms.slam.adjust.carried_frames import carried_poses
 from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment
@@ -96,8 +96,8 @@ class Mapper:
         self._waiting = InitialisationBuffer()
         self._stamps_ns: dict[int, int] = {}  # capture time of each frame
         self._motion = Motion.at(0, 0, np.eye(4))  # in the active segment
-        self._gyro = None if samples is None else Gyro.of(samples)
-        self._without_pose: list[int] = []
+        self._turns = FrameTurns.of(samples)
+        self._without_pose: dict[int, None] = {}  # lost frames, in their order
         self._lost_frames = 0
         self._keyframe_ns = 0
         self._keyframe_is_new = False
@@ -128,8 +128,8 @@ class Mapper:
     @property
     def counters(self) -> dict[str, int]:
         """Results of place comparisons, and numbers of dropped keyframes and landmarks."""
-        turned = {} if self._gyro is None else self._gyro.counters
-        return self.atlas.places.comparisons.counters | self.atlas.dropped | turned
+        atlas = self.atlas
+        return atlas.places.comparisons.counters | atlas.dropped | self._turns.counters
 
     def kept(self) -> Iterator[KeptKeyframe]:
         """Yield the keyframes of the map to be saved."""
@@ -169,15 +169,9 @@ class Mapper:
                     self._waiting = self._waiting.seen_by(before.view, self.calibration.view)
             atlas.active.links.follow(frame.extrema.ids, atlas.points)
             atlas.focus(self._motion, frame.stamp_ns, frame.extrema)
-            self._turn_to(frame.stamp_ns)
+            self._motion = self._turns.predict(self._motion, frame.stamp_ns)
         with timer("corrected view"):
             return IdealFrame.of(frame, self.calibration)
-
-    def _turn_to(self, stamp_ns: int) -> None:
-        """Ask the gyro how the camera has turned since its last pose."""
-        if self._gyro is not None:
-            turn = self._gyro.turn(self._motion.stamps_ns[1], stamp_ns)
-            self._motion = replace(self._motion, turn=turn)
 
     def _reacquire(
         self, active: ActiveMap, frame: IdealFrame, located: F64, timer: StageTimer
@@ -185,7 +179,10 @@ class Mapper:
         """Find landmarks that have lost their tracks."""
         with timer("reacquisition"):
             frame = to_global_shutter(active, self._motion, frame, located)
-            return reacquire_points(active, frame, located, self._motion.prior(self._camera))
+            prior = self._motion.prior(self._camera)
+            placed = reacquire_points(active, frame, located, prior)
+            self._turns.look(active, self._motion, placed)
+        return placed
 
     def _adjust(self, active: ActiveMap, placed: PlacedFrame, timer: StageTimer) -> PlacedFrame:
         """Adjust the frame with its landmarks, and triangulate others."""
@@ -247,10 +244,7 @@ class Mapper:
         self._place_waiting(active, keyframe, T_world_camera)
         self._waiting = InitialisationBuffer()
         to_points = tracks_to_points(active, placed)
-        before_ns, before = self._motion.stamps_ns[1], self._motion.poses[1]
-        if self._gyro is not None and before_ns < placed.frame.stamp_ns:
-            turn = before[:3, :3].T @ T_world_camera[:3, :3]
-            self._gyro.see(before_ns, placed.frame.stamp_ns, turn)
+        self._turns.see(self._motion, placed)
         self._motion = then(
             number, placed.frame.stamp_ns, T_world_camera, support.tracked, to_points
         )
@@ -298,12 +292,13 @@ class Mapper:
         if active is not None and not self._lost_frames:
             active.links.follow(frame.extrema.ids, active.points)
             self.atlas.focus(self._motion, frame.stamp_ns, frame.extrema)
-            self._turn_to(frame.stamp_ns)
+            self._motion = self._turns.predict(self._motion, frame.stamp_ns)
             found = pose_by_tracks(active, self.calibration, self._motion, frame, self._generator)
         if active is None or found is None:
             ideal = IdealFrame.of(frame, self.calibration)
             self._waiting = self._waiting.then(ideal, self._parameters)
             return self._passed_over(otherwise)
+        self._turns.look(active, self._motion, found)
         active.add_ordinary(found)
         self._go_on_from(active, found, self._motion.then_unmapped)
         return self._tracked(found)
@@ -322,6 +317,7 @@ class Mapper:
         return self.publish(self._outcome(TRACKING, "", 0, snapshot=True))
 
     def _add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int) -> None:
+        self._without_pose.pop(frame, None)
         self.journal.add_pose(frame, keyframe, T_world_camera, inliers)
         self.atlas.add_pose(frame, keyframe, T_world_camera, inliers)
 
@@ -340,8 +336,9 @@ class Mapper:
             segment.keyframes, segment.path, self._stamps_ns, segment.points, seen_by,
             self._parameters,
         )  # fmt: skip
-        if self._gyro is not None:
-            smoothed += carried_poses(smoothed, self._stamps_ns, self._without_pose, self._gyro)
+        if self._turns.gyro is not None:
+            lost = list(self._without_pose)
+            smoothed += carried_poses(smoothed, self._stamps_ns, lost, self._turns.gyro)
         for each in smoothed:
             self.journal.add_pose(each.frame, each.keyframe, each.T_world_camera, each.inliers)
 
@@ -452,7 +449,7 @@ class Mapper:
         seen = len(active.linked(MAPPED))
         reason = f"lost: the pose of frame {frame.number} is not supported, {seen} mapped tracks"
         self._lost_frames += 1
-        self._without_pose.append(frame.number)
+        self._without_pose[frame.number] = None
         self._waiting = self._waiting.then(frame, self._parameters)
         outcome = self._outcome(LOST, self._flaw(frame) or reason, 0)
         long = self._motion.lost_s(frame.stamp_ns) > self._parameters.localisation.max_lost_s

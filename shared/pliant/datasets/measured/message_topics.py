@@ -5,6 +5,7 @@ Times are those of the headers, as of the images.
 """
 
 import re
+from array import array
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -105,7 +106,7 @@ def _read(
     opened: OpenMessages, topic: MessageTopic, values_of: Callable[[Any], list[float]], width: int
 ) -> tuple[Series, int]:
     """The values of a topic, and how many messages have none."""
-    stamps, values, unreadable = list[int](), list[list[float]](), 0
+    stamps, values, unreadable = array("q"), array("d"), 0  # a tenth of lists of numbers
     for each in opened.messages(topic):
         try:
             stamp, row = capture_time(each), values_of(each.message)
@@ -113,10 +114,9 @@ def _read(
             unreadable += 1
             continue
         stamps.append(min(max(stamp, 0), (1 << 63) - 1))
-        values.append(row)
-    return Series(
-        np.array(stamps, np.int64), np.array(values, float).reshape(-1, width)
-    ), unreadable
+        values.extend(row)
+    rows = np.array(values, np.float64).reshape(-1, width)
+    return Series(np.array(stamps, np.int64), rows), unreadable
 
 
 def _gyro_and_accel(message: Any) -> list[float]:

@@ -133,8 +133,13 @@ def _figures(run: Run, report: dict[str, Any]) -> list[tuple[str, str]]:
     camera = run.stream.camera if run.stream else None
     mapped = report["median_inliers_per_frame"]
     waited = "every frame waited for the map to start"
+    by_gyro = len(report.get("frames_by_gyro", ()))
     rows = [
-        ("frames", f"{report['frames']}, {report['frames_with_pose']} with a pose"),
+        (
+            "frames",
+            f"{report['frames']}, {report['frames_with_pose']} with a pose"
+            + (f", {by_gyro} placed by the gyro alone" if by_gyro else ""),
+        ),
         *ended(report),
         ("map", f"{counted(report['keyframes'], 'keyframe')}, {report['points']:,} points"),
         (

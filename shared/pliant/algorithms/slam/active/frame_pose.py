@@ -13,8 +13,9 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.slam.active.active_map import ActiveMap
 from pliant.algorithms.slam.estimate.observation_table import reprojection_errors
-from pliant.algorithms.slam.estimate.pose import Correspondences
+from pliant.algorithms.slam.estimate.pose import Correspondences, refine_pose
 from pliant.algorithms.slam.estimate.pose_prior import NO_PRIOR, PosePrior
+from pliant.algorithms.slam.estimate.problem import BundleParameters
 from pliant.algorithms.slam.frame import IdealFrame, PlacedFrame
 from pliant.algorithms.slam.locate.inverse_depth import (
     off_epipolar_line,
@@ -52,6 +53,9 @@ _OFF = 2.0
 
 _DECIDING = 500
 """Minimum tracks that decide whether a camera stands still."""
+
+_REGULAR = 1e-9
+"""Share of its diagonal by which a singular matrix becomes regular."""
 
 _FEW, _FIRM = 0.05, 0.2
 """Minimum shares of the last frame's tracks that fit a pose: after a cut, 0.3 to 2 % fit by chance,
@@ -216,6 +220,22 @@ def refine_by_all(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
     limits = active.parameters.localisation
     located = refine(placed.T_world_camera, seen, active.camera, limits, near=True)
     return replace(placed, T_world_camera=located.T_world_camera)
+
+
+def rotation_by_image(active: ActiveMap, placed: PlacedFrame) -> tuple[F64, float]:
+    """R_world_camera (3, 3) of a frame by its image, without the prior of its pose; and the
+    variance of its largest error, rad^2."""
+    candidates = active.helping_candidates()
+    rows, points_px = active.observed(placed, candidates)
+    some = np.arange(0, len(rows), max(1, len(rows) // _DECIDING))
+    seen = _correspondences(active, NO_PRIOR, rows[some], points_px[some], len(candidates))
+    limits = active.parameters.localisation
+    bundle = BundleParameters(kernel_sigma_px=limits.kernel_sigma_px)
+    found = refine_pose(placed.T_world_camera, seen, active.camera, bundle)
+    H = found.information
+    # Without any points nothing is known: the inverse is as large as numbers allow.
+    covariance = np.linalg.inv(H + np.diag(_REGULAR * np.diag(H) + _REGULAR))
+    return found.T_world_camera[:3, :3], float(np.linalg.norm(covariance[3:, 3:], 2))
 
 
 def adjust(active: ActiveMap, motion: Motion, placed: PlacedFrame) -> PlacedFrame:

@@ -13,6 +13,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.geometry import so3_exp, so3_log
 from pliant.algorithms.inertial.gyro import Gyro, GyroTurn
+from pliant.algorithms.map_delta import BY_GYRO
 from pliant.algorithms.slam.adjust.ordinary_frames import EarlierPose
 
 _LONGEST_S = 1.0
@@ -34,7 +35,7 @@ _CONTRADICTION = 4.0
 def carried_poses(
     placed: Sequence[EarlierPose], stamps_ns: Mapping[int, int], lost: Sequence[int], gyro: Gyro
 ) -> list[EarlierPose]:
-    """Return poses of lost frames.
+    """Return poses of lost frames, which no image supports.
 
     placed: all frames of a segment with a pose, ascending.   stamps_ns: of all frames.
     lost: numbers of the frames without one, ascending.
@@ -64,10 +65,8 @@ def carried_poses(
             T[:3, :3] = a.T_world_camera[:3, :3] @ here.R @ so3_exp(share * rest)
             ends = a.T_world_camera[:3, 3], b.T_world_camera[:3, 3]
             T[:3, 3] = _cubic(share, *ends, 1e-9 * gap_ns * v_a, 1e-9 * gap_ns * v_b)
-            # What supports it is what supports both sides.
-            inliers = min(a.inliers, b.inliers)
             carried.append(
-                EarlierPose(frame=frame, keyframe=a.keyframe, T_world_camera=T, inliers=inliers)
+                EarlierPose(frame=frame, keyframe=a.keyframe, T_world_camera=T, inliers=BY_GYRO)
             )
     gyro.carried += len(carried)
     return carried

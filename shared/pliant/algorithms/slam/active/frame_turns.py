@@ -1,0 +1,78 @@
+"""How a camera turns between frames: by the gyro for the pose solver, by images for the gyro."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.inertial.gyro import Gyro
+from pliant.algorithms.inertial.samples import ImuSamples
+from pliant.algorithms.slam.active.active_map import ActiveMap
+from pliant.algorithms.slam.active.frame_pose import rotation_by_image
+from pliant.algorithms.slam.frame import PlacedFrame
+from pliant.algorithms.slam.locate.localisation import Motion
+
+
+@dataclass(frozen=True, kw_only=True)
+class ByImage:
+    """R_world_camera (3, 3) of a frame by its image alone, and the variance of its error, rad^2."""
+
+    stamp_ns: int
+    R: F64
+    variance: float
+
+
+@dataclass
+class FrameTurns:
+    """The gyro of a source, if it has one.
+
+    The gyro's rotation is a prior of a frame's pose, so that pose cannot judge the gyro.  What the
+    image alone shows can.
+
+    R_last: the last pose whose image was shown to the gyro; it moves with the world, its image not.
+    """
+
+    gyro: Gyro | None
+    last: ByImage | None = None
+    R_last: F64 = field(default_factory=lambda: np.eye(3))
+    here: ByImage | None = None
+
+    @staticmethod
+    def of(samples: ImuSamples | None) -> "FrameTurns":
+        """None: without a gyro."""
+        return FrameTurns(None if samples is None else Gyro.of(samples))
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Counts for the summary of a run."""
+        return {} if self.gyro is None else self.gyro.counters
+
+    def predict(self, motion: Motion, stamp_ns: int) -> Motion:
+        """Return the motion with the gyro's turn from the last pose to a frame."""
+        if self.gyro is None:
+            return motion
+        return replace(motion, turn=self.gyro.turn(motion.stamps_ns[1], stamp_ns))
+
+    def look(self, active: ActiveMap, motion: Motion, placed: PlacedFrame) -> None:
+        """Find what the image of a frame shows, before it changes the map.   motion: before it."""
+        self.here = None
+        if motion.turn is not None:
+            R, variance = rotation_by_image(active, placed)
+            self.here = ByImage(stamp_ns=placed.frame.stamp_ns, R=R, variance=variance)
+
+    def see(self, motion: Motion, placed: PlacedFrame) -> None:
+        """Show the gyro how the camera has turned to a frame.   motion: before it."""
+        gyro, stamp_ns, last = self.gyro, placed.frame.stamp_ns, self.last
+        if gyro is None or gyro.is_over:
+            return
+        R, here = placed.T_world_camera[:3, :3], self.here
+        if here is None:
+            here = ByImage(stamp_ns=stamp_ns, R=R, variance=0.0)
+        before_ns, before = motion.stamps_ns[1], motion.poses[1][:3, :3]
+        if before_ns < stamp_ns:
+            variance = here.variance
+            if last is not None and last.stamp_ns == before_ns:
+                before = before @ self.R_last.T @ last.R
+                variance += last.variance
+            gyro.see(before_ns, stamp_ns, before.T @ here.R, variance)
+        self.last, self.R_last, self.here = here, R, None

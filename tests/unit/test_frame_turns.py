@@ -1,0 +1,77 @@
+"""What images show of a camera's turns, where its poses have a prior by the gyro."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import so3_exp, so3_log
+from pliant.algorithms.inertial.gyro import GyroTurn
+from pliant.algorithms.slam.active.frame_turns import FrameTurns
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import MappingParameters
+from pliant.algorithms.tracks import FrameExtrema
+
+CAMERA = PinholeCamera(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
+POINTS = np.random.default_rng(0).uniform((-2.0, -1.5, 3.0), (2.0, 1.5, 8.0), (300, 3))
+STEP_NS, FEW = 33_333_333, 40
+
+
+def R_world_camera(frame: int) -> F64:
+    return so3_exp(np.array([0.0, -0.01 * frame, 0.0]))
+
+
+def seen(frame: int, count: int) -> Frame:
+    """Tracks of the first points."""
+    centre = np.array([0.1 * frame, 0.02 * frame, 0.0])
+    px = CAMERA.project((POINTS[:count] - centre) @ R_world_camera(frame)).astype(np.float32)
+    tracks = FrameExtrema(
+        ids=np.arange(count), points_px=px, ages=np.full(count, frame, np.int32),
+        kappas=np.ones(count, np.float32), states=np.zeros(count, np.uint8),
+        maxima=np.column_stack([px, np.ones(count)]).astype(np.float32),
+        dominant_flow=np.eye(2, 3),
+    )  # fmt: skip
+    return Frame(frame, STEP_NS * frame, tracks)
+
+
+class WrongGyro:
+    """It is sure of turns that are wrong by a constant."""
+
+    is_over, counters = False, {}
+
+    def __init__(self) -> None:
+        self.shown: list[tuple[F64, float]] = []
+
+    def turn(self, first_ns: int, second_ns: int) -> GyroTurn:
+        frames = round((second_ns - first_ns) / STEP_NS)
+        wrong = so3_exp(np.array([0.0, -0.01 * frames + 1e-3, 0.0]))
+        return GyroTurn(R=wrong, covariance=1e-10 * np.eye(3))
+
+    def see(self, first_ns: int, second_ns: int, R: F64, variance: float) -> None:
+        self.shown.append((R, variance))
+
+
+def test_a_gyro_is_judged_by_images_without_its_own_part_in_the_pose() -> None:
+    mapper, gyro = Mapper(CAMERA, MappingParameters(), seed=0), WrongGyro()
+    for frame in range(10):
+        mapper.process(seen(frame, len(POINTS)))
+    mapper._turns = FrameTurns(gyro)  # type: ignore[arg-type]
+    poses = [mapper._motion.poses[1][:3, :3]]
+    for frame in range(10, 14):
+        mapper.process(seen(frame, FEW))
+        poses.append(mapper._motion.poses[1][:3, :3])
+    true = R_world_camera(9).T @ R_world_camera(10)
+
+    def off(turn: F64) -> float:
+        return float(np.linalg.norm(so3_log(true.T @ turn)))
+
+    dragged = [off(before.T @ after) for before, after in pairwise(poses)]
+    by_images = [off(turn) for turn, _ in gyro.shown]
+    assert len(by_images) == 4
+    assert dragged[1] > 1e-4
+    assert by_images[1] < 0.01 * dragged[1]
+    # Later ones are those in a map whose landmarks have been dragged along.
+    assert max(by_images) < 0.5 * max(dragged)
+    assert all(0.0 < variance < 2.0 * (1.0 / CAMERA.fx) ** 2 for _, variance in gyro.shown)
