@@ -55,7 +55,7 @@ def run_play(request: PlayRequest) -> int:
     what = Played(
         start_s=request.start_s,
         end_s=request.end_s,
-        # Services join topics by frame; viewers want to know the map.
+        # Services join topics by frame; viewers need the map.
         lead_frames=0 if request.readers else config.bundle_adjustment.snapshot_frames,
         topics=request.topics,
         readers=required,

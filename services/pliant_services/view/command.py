@@ -29,7 +29,7 @@ from pliant.viewers.drawn_scene import Scene
 from pliant.viewers.rerun import RerunCanvas, Where
 from pliant_services.runtime.announced import running_session
 
-_WAITING = 512  # messages between the network and the drawing; the oldest give way
+_WAITING = 512  # messages between the network and the drawing; beyond, the oldest are dropped
 _WAITING_BYTES = 256 << 20
 _ASK_S = 0.5
 _GONE_S = 0.2  # what is on the way when the last service has gone

@@ -142,7 +142,7 @@ class BoardFinder:
 
 
 def boards_seen(images: Sequence[U8]) -> list[str]:
-    """In words, which boards the images (H, W) show: for a user who named another."""
+    """Describe the boards that the images (H, W) show, for a user who named another."""
     for name in _LARGEST:
         detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARIES[name]))
         found: list[Any] = [detector.detectMarkers(grey)[1] for grey in images]

@@ -86,7 +86,7 @@ class Result(Mapped):
 
     @property
     def history(self) -> MapHistory:
-        """All segments of the map, with what it knew when."""
+        """All segments of the map and their history."""
         return self._run.history
 
     @cached_property

@@ -315,7 +315,7 @@ class ZenohBus:
     def _take(
         self, entries: Sequence[InLink], timeout_s: float | None = None, *, views: bool = False
     ) -> Received | None:
-        """The next message, looked into: what does not fit its topic is passed over."""
+        """The next valid message; malformed ones are skipped."""
         self._disturb()
         deadline = time.monotonic() + timeout_s if timeout_s is not None else None
         while True:

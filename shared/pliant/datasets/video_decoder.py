@@ -166,7 +166,7 @@ def _packets(
 ) -> cv2.VideoCapture | None:
     """The packets of a stream, if they can be decoded one by one.
 
-    Of a container that is not understood they are those of what FFmpeg takes for its best stream.
+    If the container is unknown, they are those of FFmpeg's choice of the best stream.
     """
     if not decodes(codec_of(capture)):
         return None

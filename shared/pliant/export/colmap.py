@@ -55,7 +55,7 @@ def seen_model(
     recording: Recording, ideal: IdealCamera, images: list[PosedImage], points: Points,
     crop: Box | None = None,
 ) -> tuple[list[ColmapImage], I64]:  # fmt: skip
-    """The images with the points that they see, and (K,) rows of the points that two of them see.
+    """The images with their points, and (K,) rows of the points that two of them observe.
 
     Points of an image are numbers of those rows.    crop: only points in this box.
     """

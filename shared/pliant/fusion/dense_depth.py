@@ -110,7 +110,7 @@ class DenseDepths:
         self._taken[keyframe] = _Taken(T_world_camera, some, sharpness(grey))
 
     def sweep(self, seen: Iterable[tuple[int, SeenPoints]], timer: StageTimer = no_stages) -> None:
-        """The first pass, when all are taken: of keyframes and what each sees."""
+        """The first pass, over all keyframes and the points that each observes."""
         known = ((keyframe, points) for keyframe, points in seen if keyframe in self._taken)
         results = in_order(self._swept, known, self._workers)
         while True:

@@ -204,7 +204,7 @@ class Mesher:
 
     @property
     def behind(self) -> int:
-        """Keyframes that the live mesh lacks, or has elsewhere than the map: ``fuse`` takes one."""
+        """Keyframes that the live mesh lacks or has at an old pose: ``fuse`` takes one."""
         return len(self._again)
 
     @property
@@ -384,7 +384,7 @@ class Mesher:
     def _within(
         self, keyframe: int, depth_map: DepthMap, correction: tuple[float, ...]
     ) -> DepthMap:
-        """Without what the mask of a keyframe covers."""
+        """The depth map without the pixels that the keyframe's mask covers."""
         used = unmasked(self._spool.mask(keyframe), view_of(self._camera, correction))
         return depth_map if used is None else depth_map.within(used)
 

@@ -25,7 +25,7 @@ _SHARE_OF_FREE = 0.5
 
 
 class VoxelFile(InMemory):
-    """A context manager.  The files have no name: they are gone with the process.
+    """A context manager.  The files have no name and vanish with the process.
 
     size_bytes: of the files, 0 while all is in memory.
     """

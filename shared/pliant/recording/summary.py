@@ -84,7 +84,7 @@ class Summary:
 
     @property
     def repeated(self) -> int:
-        """Messages that are there more than once, over all topics."""
+        """Number of duplicate messages in all topics."""
         return sum(topic.repeated for topic in self.topics.values())
 
     @property

@@ -267,7 +267,7 @@ def settle_killed(output: Path) -> None:
 
 
 def let_go(output: Path) -> None:
-    """Delete the earlier result: the new one has begun, and its recording is put on the disk.
+    """Delete the earlier result, once the recording of the new one is on disk.
 
     Raises ResultError.
     """
