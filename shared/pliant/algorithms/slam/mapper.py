@@ -141,6 +141,7 @@ class Mapper:
 
     def take(self, frame: Frame, timer: StageTimer = no_stages) -> Outcome:
         """Localise a frame and extend the map."""
+        self._stamps_ns[frame.number] = frame.stamp_ns
         ideal = self._catch_up(frame, timer)
         located = self._locate(ideal, timer)
         active = self.atlas.active
@@ -159,24 +160,22 @@ class Mapper:
 
     def _catch_up(self, frame: Frame, timer: StageTimer) -> IdealFrame:
         """Apply finished corrections of map and calibration, and correct the frame by them."""
-        atlas = self.atlas
-        self._stamps_ns[frame.number] = frame.stamp_ns
-        if atlas.active is not None:
+        if self.atlas.active is not None:
             with timer("whole map"):
                 before = self.calibration
-                self.follow(atlas.catch_up(frame.number))
+                self.follow(self.atlas.catch_up(frame.number))
                 if not self.calibration.sees_like(before):
                     self._waiting = self._waiting.seen_by(before.view, self.calibration.view)
-            atlas.active.links.follow(frame.extrema.ids, atlas.points)
-            atlas.focus(self._motion, frame.stamp_ns, frame.extrema)
-            self._turn_to(frame.stamp_ns)
+            self._predict(self.atlas.active, frame)
         with timer("corrected view"):
             return IdealFrame.of(frame, self.calibration)
 
-    def _turn_to(self, stamp_ns: int) -> None:
-        """Ask the gyro how the camera has turned since its last pose."""
+    def _predict(self, active: ActiveMap, frame: Frame) -> None:
+        """Continue the tracks and the focal length, and predict the rotation by the gyro."""
+        active.links.follow(frame.extrema.ids, active.points)
+        self.atlas.focus(self._motion, frame.stamp_ns, frame.extrema)
         if self._gyro is not None:
-            turn = self._gyro.turn(self._motion.stamps_ns[1], stamp_ns)
+            turn = self._gyro.turn(self._motion.stamps_ns[1], frame.stamp_ns)
             self._motion = replace(self._motion, turn=turn)
 
     def _reacquire(
@@ -296,9 +295,7 @@ class Mapper:
         self._stamps_ns[frame.number] = frame.stamp_ns
         self._keyframe_is_new = False
         if active is not None and not self._lost_frames:
-            active.links.follow(frame.extrema.ids, active.points)
-            self.atlas.focus(self._motion, frame.stamp_ns, frame.extrema)
-            self._turn_to(frame.stamp_ns)
+            self._predict(active, frame)
             found = pose_by_tracks(active, self.calibration, self._motion, frame, self._generator)
         if active is None or found is None:
             ideal = IdealFrame.of(frame, self.calibration)
