@@ -36,7 +36,7 @@ _CLASSES = {
     "Journal",
     *("SurfelTracker", "MapDepth", "CurrentMap", "_PointTable"),
 }
-"""Those that are no records: neither dataclasses, nor named tuples, nor parameters."""
+"""Classes that are neither dataclasses, named tuples, nor parameters."""
 _FUNCTIONS = {"no_stages"}
 
 _PLAIN = (type(None), bool, float, str, bytes)

@@ -102,7 +102,7 @@ def _identity(tls: Path | None, name: str) -> Identity | None:
 def _required(
     playback: Playback, readers: Sequence[str]
 ) -> tuple[dict[Topic, list[str]], set[Topic]]:
-    """Who must read what, and what is not played because the readers publish it themselves."""
+    """The readers of each topic, and the topics that readers publish themselves, so not played."""
     able = sorted(name for name, process in BY_NAME.items() if process.inputs or process.observer)
     wrong = [name for name in readers if name not in able]
     if wrong:

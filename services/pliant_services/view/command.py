@@ -248,7 +248,7 @@ def _draw_while(canvas: Canvas, waiting: Backlog, goes_on: Callable[[], bool]) -
 
 
 def _tokens(connection: zenoh.Session, session: str) -> list[str]:
-    """Of the services that are there, those of other versions included."""
+    """Liveliness tokens of all services present, also of other versions."""
     replies = connection.liveliness().get(f"pliant/{session}/ready/**")
     return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 

@@ -324,7 +324,7 @@ def _minimised(
 
 
 def _jackknifed(views: Sequence[BoardView], fit: _Fit) -> float:
-    """Of the logarithm of the mean focal length; inf where leaving views out leaves no lens."""
+    """Jackknife sigma of the log mean focal length; inf if a fit without some views fails."""
     folds = min(_FOLDS, len(views))
     logs: list[float] = []
     lens = fit.lens

@@ -19,7 +19,7 @@ from pliant.map_history import MapHistory
 from pliant.offline import Pipeline
 
 _FPS = 30.0
-"""Of images that come without a time."""
+"""Frames per second of images without a time."""
 
 
 class Slam(Mapped):

@@ -361,7 +361,7 @@ class ZenohBus:
         return state
 
     def start_from(self, taken: Mapping[str, int], ended: Collection[str]) -> None:
-        """For a service that keeps its own books: take up each input where it left it."""
+        """Resume each input where a service that keeps its own books left it."""
         for key in ended:
             self._inputs[key].ended = True
         self._start_from(Place(-1, taken, {}))

@@ -58,7 +58,7 @@ class RosCamera(MessageImages):
                 self.notes.append(str(error))
 
     def heard(self) -> Measurements:
-        """What other sensors have measured since the images are read."""
+        """Measurements of other sensors since the first image."""
         try:
             return sensors_of(self._heard, self._spec)
         except DatasetError as error:

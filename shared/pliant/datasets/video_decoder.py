@@ -20,7 +20,7 @@ from pliant.errors import DatasetError
 
 _DEFAULT_FPS = 30.0
 _MOST_LINES = 1088
-"""Of interlaced video."""
+"""Maximum lines of interlaced video."""
 _LOOKED_AT = 8
 """Pictures by which a stream counts as interlaced or not."""
 _SAME_ASPECT = 0.01

@@ -21,7 +21,7 @@ _GROWTH = 1.25
 _COPIED = 4096
 """Blocks at a time, when memory is full of them."""
 _SHARE_OF_FREE = 0.5
-"""Of the disk, at the most: others need some, too."""
+"""Maximum share of the free disk: other programs need some, too."""
 
 
 class VoxelFile(InMemory):

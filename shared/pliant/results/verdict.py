@@ -105,7 +105,7 @@ def _scale_lines(report: dict[str, Any]) -> list[str]:
 
 
 def _told_by_gyro(counters: Mapping[str, float]) -> list[str]:
-    """What the gyro has done for the poses, where that is worth a line."""
+    """A line about the poses by the gyro, if there are any."""
     frames, carried = (int(counters.get(f"gyro_{name}", 0)) for name in ("frames", "carried"))
     lines: list[str] = []
     if carried:

@@ -1,4 +1,4 @@
-"""What maps or localises the frames of a source: one interface for the three that do."""
+"""The interface of the three classes that map or localise the frames of a source."""
 
 from collections.abc import Iterable
 from typing import Protocol
