@@ -105,36 +105,6 @@ class Mapper:
         self._published_frames = 0
         self._focals_published = False
 
-    @property
-    def calibration(self) -> SelfCalibration:
-        """The current calibration."""
-        return self.atlas.calibration
-
-    @property
-    def _camera(self) -> PinholeCamera:
-        """The ideal camera in whose pixels the mapper works."""
-        return self.calibration.view.camera
-
-    @property
-    def global_adjustment(self) -> GlobalAdjustment:
-        """Global bundle adjustment of the active segment."""
-        return self.atlas.global_adjustment
-
-    @property
-    def point_count(self) -> int:
-        """Number of landmarks in all segments."""
-        return self.atlas.point_count
-
-    @property
-    def counters(self) -> dict[str, int]:
-        """Results of place comparisons, and numbers of dropped keyframes and landmarks."""
-        turned = {} if self._gyro is None else self._gyro.counters
-        return self.atlas.places.comparisons.counters | self.atlas.dropped | turned
-
-    def kept(self) -> Iterator[KeptKeyframe]:
-        """Yield the keyframes of the map to be saved."""
-        return self.atlas.kept()
-
     def process(self, frame: Frame, timer: StageTimer = no_stages) -> MapDelta:
         """Localise a frame, extend the map, and return what readers need."""
         return self.publish(self.take(frame, timer))
@@ -482,3 +452,33 @@ class Mapper:
                 log_focals=np.array([keyframe.log_focal for keyframe in made]),
             )
         return delta
+
+    @property
+    def calibration(self) -> SelfCalibration:
+        """The current calibration."""
+        return self.atlas.calibration
+
+    @property
+    def _camera(self) -> PinholeCamera:
+        """The ideal camera in whose pixels the mapper works."""
+        return self.calibration.view.camera
+
+    @property
+    def global_adjustment(self) -> GlobalAdjustment:
+        """Global bundle adjustment of the active segment."""
+        return self.atlas.global_adjustment
+
+    @property
+    def point_count(self) -> int:
+        """Number of landmarks in all segments."""
+        return self.atlas.point_count
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Results of place comparisons, and numbers of dropped keyframes and landmarks."""
+        turned = {} if self._gyro is None else self._gyro.counters
+        return self.atlas.places.comparisons.counters | self.atlas.dropped | turned
+
+    def kept(self) -> Iterator[KeptKeyframe]:
+        """Yield the keyframes of the map to be saved."""
+        return self.atlas.kept()
