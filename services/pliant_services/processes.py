@@ -143,7 +143,7 @@ def outputs_of(name: str) -> tuple[Topic, ...]:
 def readers_of(
     name: str, fleet: Sequence[str], *, images: bool = True
 ) -> Mapping[Topic, tuple[str, ...]]:
-    """For each topic that a service publishes, who in the fleet must read every message."""
+    """The services that must read every message, for each topic that a service publishes."""
     return {
         topic: tuple(reader for reader in fleet if topic in inputs_of(reader, fleet, images=images))
         for topic in outputs_of(name)

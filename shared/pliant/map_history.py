@@ -193,7 +193,7 @@ class CurrentMap:
         self._points.move(moves)
 
     def points_of(self, ids: I64) -> tuple[I64, Points]:
-        """Those of the points (N,) that exist: their places in ``ids``, and the points."""
+        """The existing points of ids (N,): their indices in ``ids``, and the points."""
         return self._points.of(ids)
 
     def points(self) -> Points:
@@ -201,7 +201,7 @@ class CurrentMap:
         return self._points.of(self._points.alive())[1]
 
     def points_in(self, segment: int) -> Points:
-        """Those of a segment: each is a world of its own."""
+        """The points of a segment, which is a world of its own."""
         points = self.points()
         return points.select(points.segments == segment)
 
@@ -287,7 +287,7 @@ class MapHistory(CurrentMap):
         return max(counts, key=counts.__getitem__, default=-1)
 
     def trajectory_in(self, segment: int, poses: dict[int, tuple[int, F64]]) -> Trajectory:
-        """Those of the poses that are in a segment, as ``trajectory``."""
+        """The poses in a segment, as ``trajectory``."""
         return self.trajectory({f: pose for f, pose in poses.items() if pose[0] == segment})
 
     def trajectory(self, poses: dict[int, tuple[int, F64]]) -> Trajectory:

@@ -33,7 +33,7 @@ def to_mesh(mesh: TriangleMesh) -> Any:
 
 
 def from_mesh(mesh: Any) -> TriangleMesh:
-    """Of Open3D's mesh; its normals are computed from its triangles."""
+    """Convert Open3D's mesh; its normals are computed from its triangles."""
     mesh.compute_vertex_normals()
     colours = 255.0 * np.asarray(mesh.vertex_colors, np.float64).reshape(-1, 3)
     return TriangleMesh(

@@ -8,7 +8,7 @@ from typing import Any
 from pliant.errors import PliantError
 
 SYSTEM_PACKAGES = "libegl1 libgl1 libx11-6 libusb-1.0-0"
-"""Of Debian and Ubuntu, which `import open3d` needs."""
+"""Packages of Debian and Ubuntu that `import open3d` needs."""
 
 OPEN3D_IS_FOR = "--watertight, `pliant view --open3d` and `to_open3d()`"
 

@@ -20,7 +20,7 @@ _PREFIX = ".partial-"
 
 @contextmanager
 def staging(folder: Path) -> Generator[Path]:
-    """A new folder within another one; what is left in it at the end goes.  Raises OSError."""
+    """A new folder within another one, deleted at the end with what is left.  Raises OSError."""
     clear_staging(folder)
     path, lock = _locked_folder(folder)
     try:

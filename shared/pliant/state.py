@@ -39,7 +39,7 @@ _CLASSES = {
     "Journal",
     *("SurfelTracker", "MapDepth", "CurrentMap", "_PointTable"),
 }
-"""Those that are no records: neither dataclasses, nor named tuples, nor parameters."""
+"""Classes that are neither dataclasses, named tuples, nor parameters."""
 _FUNCTIONS = {"no_stages"}
 _CONSTANT = {"GyroSignal"}
 """Records that never change: a state names them where there is a store for them."""

@@ -1,12 +1,8 @@
-"""Whole runs, many times: is anything lost, what does recording cost, what does a kill change?"""
+"""Whole runs, many times: is anything lost, what does recording cost, when is the first frame?"""
 
-import os
-import random
-import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -22,7 +18,7 @@ from pliant.messages import topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import Status
 from pliant.recording.reader import Recording
-from pliant.results.folder import RECORDING_NAME, STATE_FOLDER, prepare
+from pliant.results.folder import RECORDING_NAME, prepare
 from pliant.results.write import write_results
 from pliant_services.profiles import PROFILES
 from pliant_services.run.command import RunRequest, service_arguments
@@ -90,56 +86,24 @@ def first_frame(source: str, runs: int) -> Iterator[str]:
     yield markdown(("first message of", "s after the start"), rows)
 
 
-def kills(source: str, count: int, seed: int) -> Iterator[str]:
-    """kill -9 of each service, and of all at once, at random moments; compare the results."""
-    chance = random.Random(seed)
-    services = SERVICES
-    expected = _files_of_a_run(source, services, None)
-    yield markdown_header(("killed", "times", "byte-identical results"))
-    for victims in (*((name,) for name in services), services):
-        same = 0
-        for _ in range(count):
-            moment = chance.random()
-            same += _files_of_a_run(source, services, (moment, victims)) == expected
-        name = victims[0] if len(victims) == 1 else "all at once"
-        yield markdown_row((name, str(count), f"{same} of {count}"))
-
-
-def _files_of_a_run(
-    source: str, services: Sequence[str], kill: tuple[float, Sequence[str]] | None
-) -> dict[str, bytes]:
-    with tempfile.TemporaryDirectory() as folder:
-        output = Path(folder)
-        run_once(source, output, services, state=output / STATE_FOLDER, kill=kill)
-        write_results(output)
-        return {name: (output / name).read_bytes() for name in FILES}
-
-
 def run_once(
     source: str,
     output: Path,
     services: Sequence[str],
     *,
-    state: Path | None = None,
-    kill: tuple[float, Sequence[str]] | None = None,
     beside: Callable[[Fleet], AbstractContextManager[object]] = nullcontext,
 ) -> float:
-    """One run; returns its frames a second.
-
-    kill: at which share of the run, and whom.     beside: entered before the services start.
-    """
+    """One run; returns its frames a second.   beside: entered before the services start."""
     warm_up.compile_kernels(print)
     request = RunRequest(source=SourceSpec(location=source))
     prepare(output, config_yaml(load_config()))
     times: list[float] = []
-    when = _Killer(kill)
 
     def on_status(status: Status) -> None:
         if status.service == "bundle_adjustment":
             times.append(time.monotonic())
-            when.on_frame(status.frame, fleet.pids)
 
-    fleet = Fleet(services, log_folder=output / "logs", on_status=on_status, state=state)
+    fleet = Fleet(services, log_folder=output / "logs", on_status=on_status)
     try:
         with beside(fleet):
             fleet.start(lambda name: service_arguments(name, request, output))
@@ -147,25 +111,3 @@ def run_once(
     finally:
         fleet.close()
     return (len(times) - 1) / (times[-1] - times[0])
-
-
-class _Killer:
-    """Kills once, at a moment that is a share of the frames, and not only between two frames."""
-
-    FRAMES = 300
-
-    def __init__(self, kill: tuple[float, Sequence[str]] | None) -> None:
-        self._kill = kill
-        self._done = kill is None
-
-    def on_frame(self, frame: int, pids: dict[str, int]) -> None:
-        if self._kill is None or self._done or frame < self._kill[0] * self.FRAMES:
-            return
-        self._done = True
-        victims = [pids[name] for name in self._kill[1]]
-
-        def strike() -> None:
-            for pid in victims:
-                os.kill(pid, signal.SIGKILL)
-
-        threading.Timer(0.05 * self._kill[0], strike).start()

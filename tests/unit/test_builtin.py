@@ -10,7 +10,7 @@ import yaml
 from pliant.cache import cache_folder
 from pliant.datasets import builtin
 from pliant.datasets.base import is_builtin
-from pliant.datasets.builtin import SequenceOptions, builtin_folder, parse_builtin, render_sequence
+from pliant.datasets.builtin import SequenceOptions, builtin_folder, parse_builtin
 from pliant.errors import DatasetError
 
 SMALL = "built-in:tiny?frames=3&width=64"
@@ -59,8 +59,8 @@ def test_the_surface_is_at_the_given_depth(folder: Path):
 
 
 def test_rendering_twice_gives_the_same_bytes(folder: Path, tmp_path: Path):
-    name, options = parse_builtin(SMALL)
-    again = render_sequence(name, tmp_path / "again", options)
+    again = builtin_folder(SMALL, cache=tmp_path)
+    assert again != folder
     assert contents(again) == contents(folder)
 
 
@@ -107,11 +107,8 @@ def test_a_given_path_is_followed_at_its_own_times(tmp_path: Path):
     file = tmp_path / "path.txt"
     lines = ["1.500000000 1.2 0 0.6 0 0 0 1", "1.550000000 1.3 0 0.6 0 0 0 1"]
     file.write_text("\n".join(lines) + "\n")
-    out = render_sequence(
-        "tiny",
-        tmp_path / "out",
-        SequenceOptions(width=64, path=str(file), distortion=(-0.1, 0, 0, 0)),
-    )
+    source = f"built-in:tiny?width=64&path={file}&distortion=-0.1,0,0,0"
+    out = builtin_folder(source, cache=tmp_path)
     poses = np.loadtxt(out / "groundtruth.txt")
     np.testing.assert_allclose(poses, [[float(x) for x in line.split()] for line in lines])
     calibration = yaml.safe_load((out / "calib.yaml").read_text())
@@ -148,11 +145,6 @@ def test_impossible_options_get_one_clear_line(source: str, message: str, tmp_pa
     with pytest.raises(DatasetError, match=message) as caught:
         builtin_folder(source, cache=tmp_path)
     assert "\n" not in str(caught.value)
-
-
-def test_an_existing_folder_is_not_overwritten(tmp_path: Path):
-    with pytest.raises(DatasetError, match="already exists"):
-        render_sequence("tiny", tmp_path)
 
 
 def test_a_cache_that_cannot_be_written_is_named(tmp_path: Path):

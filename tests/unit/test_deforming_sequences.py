@@ -9,7 +9,7 @@ import pytest
 
 from pliant.algorithms.geometry import inverse, transform
 from pliant.datasets import builtin_deforming
-from pliant.datasets.builtin import builtin_folder, is_deforming, parse_builtin, render_sequence
+from pliant.datasets.builtin import builtin_folder, is_deforming
 from pliant.errors import DatasetError
 from pliant.rendering.deforming_scenes import (
     DEFORMING,
@@ -167,8 +167,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_a_folder_is_the_same_in_every_rendering(tmp_path: Path) -> None:
     source = "built-in:sliding?frames=22&width=64&tool=1&light=0.3&gloss=1&drop=3"
     first = builtin_folder(source, cache=tmp_path)
-    name, options = parse_builtin(source)
-    assert contents(render_sequence(name, tmp_path / "again", options)) == contents(first)
+    assert contents(builtin_folder(source, cache=tmp_path / "again")) == contents(first)
     times = [float(line.split()[0]) for line in (first / "rgb.txt").read_text().splitlines()[1:]]
     np.testing.assert_allclose(np.array(times) * 30.0, [*range(20), 23, 24], atol=1e-6)
     with np.load(first / builtin_deforming.SURFACES_NAME) as surfaces:

@@ -136,7 +136,7 @@ def run_batch(
 
 @contextmanager
 def _engine(dask: str | None, jobs: int) -> Generator[Callable[..., None]]:
-    """Who runs the clips."""
+    """Return the function that runs a clip: here, or on a cluster."""
     if dask is None:
         yield partial(_run_here, jobs=jobs)
         return
@@ -186,7 +186,7 @@ def _run_here(
     *,
     jobs: int,
 ) -> None:
-    """That many at a time.  Ctrl-C cuts off those that run; raises KeyboardInterrupt then."""
+    """Run this many clips at a time.  Ctrl-C interrupts them and raises KeyboardInterrupt."""
     stopped = threading.Event()
 
     def run(name: str, errand: Errand) -> None:

@@ -119,7 +119,7 @@ def _run(name: str, errand: Errand, topic: str) -> Outcome:
     key = worker.get_current_task()
 
     def unwanted() -> bool:
-        """Whether its result is no longer awaited, or the worker leaves."""
+        """Whether its result is no longer needed, or the worker shuts down."""
         task = worker.state.tasks.get(key)
         leaves = worker.status.name in ("closing", "closed", "failed")
         return task is None or task.state == "cancelled" or leaves

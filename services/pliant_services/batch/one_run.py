@@ -63,7 +63,7 @@ def run_clip(errand: Errand, stopped: Callable[[], bool]) -> Outcome:
             f"{platform.node()} has no folder {log.parent}: put clips and results in a folder "
             "with the same name on all machines"
         )
-    # A waiting one with a log was begun by a worker that could not report it any more.
+    # A waiting clip with a log was begun by a worker that could no longer report it.
     begun = errand.state == "begun" or (errand.state == "waiting" and log.exists())
     while begun and is_being_written(result):  # by a run that has outlived who began it
         if stopped():

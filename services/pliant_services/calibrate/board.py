@@ -21,7 +21,7 @@ _LEAST_CORNERS = 8
 _PAPERS_MM = ((210.0, 297.0), (297.0, 210.0), (297.0, 420.0), (420.0, 297.0))
 _MARGIN_MM = 8.0
 _FOOT_MM = 14.0
-"""For the words and the ruler below the board."""
+"""Height of the words and the ruler below the board."""
 _RULER_MM = 100.0
 
 

@@ -1,4 +1,4 @@
-"""A calibration from a video, of a board or of anything."""
+"""Calibration from a video, with a board or without."""
 
 import contextlib
 import io

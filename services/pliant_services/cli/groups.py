@@ -5,7 +5,7 @@ from typing import Any
 from typer.core import TyperCommand, TyperGroup
 
 GROUPS = EVERYDAY, LOOK, MACHINES, DEVELOPMENT = "Everyday", "Look", "Machines", "Development"
-"""Of commands, as their ``rich_help_panel``, which typer shows with Rich alone: that would load
+"""Groups of commands: their ``rich_help_panel``, which typer shows with Rich alone: that would load
 half of Rich for each help page, and take [the defaults] in help texts for markup."""
 
 

@@ -69,7 +69,7 @@ from pliant_services.runtime.link_images import clearance, receive_images, whole
 from pliant_services.runtime.monitor import Monitor
 
 _Kept: TypeAlias = tuple[bytes, bytes]
-"""Of a frame: its image as a JPEG, and its mask."""
+"""A frame's image as a JPEG, and its mask."""
 
 _JPEG_QUALITY = 95
 """The image gives the mesh its colours alone: a tenth of the bytes, in 2 ms."""

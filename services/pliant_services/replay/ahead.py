@@ -57,8 +57,8 @@ def behind() -> Generator[Do]:
 def quick_turns() -> Generator[None]:
     """Threads take turns a hundred times as often as usual.
 
-    Who comes back from a kernel, which runs without Python's lock, waits for it no longer than
-    this; as usual it would be as long as the kernels of a frame take.
+    A thread that returns from a kernel, which runs without Python's lock, waits for the lock no
+    longer than this; by default it would wait as long as the kernels of a frame take.
     """
     usual = sys.getswitchinterval()
     sys.setswitchinterval(_TURN_S)

@@ -53,8 +53,8 @@ class ReplayRequest:
 
 
 def comparable(made: Sequence[Topic], mode: str, metadata: Metadata) -> list[Topic]:
-    """What must be the same: in live mode the live mesh shows what there was time for, and of two
-    passes a replay makes the first."""
+    """Topics that must be equal: not the live mesh of live mode, which depends on time, and of two
+    passes only the first, which a replay repeats."""
     other = {topics.MESH_BLOCKS.key} if mode == "live" else set[str]()
     if topics.MAP_FINAL in made:
         other |= set(metadata.get(SECOND_PASS, {}).get("topics", "").split())

@@ -55,7 +55,7 @@ def run_play(request: PlayRequest) -> int:
     what = Played(
         start_s=request.start_s,
         end_s=request.end_s,
-        # Services join topics by frame; viewers want to know the map.
+        # Services join topics by frame; viewers need the map.
         lead_frames=0 if request.readers else config.bundle_adjustment.snapshot_frames,
         topics=request.topics,
         readers=required,
@@ -102,7 +102,7 @@ def _identity(tls: Path | None, name: str) -> Identity | None:
 def _required(
     playback: Playback, readers: Sequence[str]
 ) -> tuple[dict[Topic, list[str]], set[Topic]]:
-    """Who must read what, and what is not played because the readers publish it themselves."""
+    """The readers of each topic, and the topics that readers publish themselves, so not played."""
     able = sorted(name for name, process in BY_NAME.items() if process.inputs or process.observer)
     wrong = [name for name in readers if name not in able]
     if wrong:

@@ -251,7 +251,7 @@ def _go_through(
 def _told_poses(request: RunRequest, fleet: Fleet) -> AbstractContextManager[None]:
     if not request.poses:
         return nullcontext()
-    from pliant_services.run.poses import told_poses  # it loads what other runs have no use for
+    from pliant_services.run.poses import told_poses  # loads modules that other runs do not need
 
     known = None if request.known is None else MapFile(request.known)
     return told_poses(fleet, known, deformable=request.profile == _DEFORMABLE)

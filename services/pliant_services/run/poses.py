@@ -24,7 +24,7 @@ from pliant.recording.map_file import MapFile
 from pliant_services.runtime.launcher import Fleet
 
 _LAST_S = 5.0
-"""For what is on the way when the service that said it has left."""
+"""Maximum wait for the last poses after their service has ended, s."""
 
 
 @contextmanager

@@ -199,7 +199,7 @@ def _keyframes(rest: Keyframe, reached: Reached) -> Keyframe:
 
 
 def _masks(rest: Keyframe, made: list[bytes]) -> tuple[bytes, ...]:
-    """Of all images beside them, or none where none has one."""
+    """Masks of all images, or none if no image has one."""
     before = rest.earlier_masks or (b"",) * len(rest.earlier_jpegs)
     masks = (*before, *made)
     return masks if any(masks) else ()

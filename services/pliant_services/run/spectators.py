@@ -47,9 +47,9 @@ class Viewer:
         return self
 
     def start(self, fleet: Fleet) -> None:
-        """Start it and wait until it is there: before the first frame.
+        """Start the viewer and wait until it is ready, before the first frame.
 
-        Raises ResultError where it does not come up.
+        Raises ResultError if it does not start.
         """
         command = [
             *(sys.executable, "-m", "pliant_services.cli", "view"),

@@ -1,7 +1,7 @@
 """The address of an active run: ``session.json`` in its result folder.
 
-It is believed only while a process holds the folder, and only of an endpoint on this machine: a run
-that was killed leaves its file behind, and a folder may come from anybody.
+It is used only while a process holds the folder, and only for an endpoint on this machine: a killed
+run leaves its file behind, and the folder may be a foreign one.
 """
 
 import json

@@ -71,7 +71,7 @@ class Child:
             log.close()
 
     def obituary(self) -> str:
-        """Who died of what: one line where it said so itself, else its last words."""
+        """The service and the cause of its end: its own one-line error, or its last output."""
         words, code = self.last_words(), self.process.returncode
         if words and words[-1].startswith("pliant: "):
             return f"{self.name}: {words[-1].removeprefix('pliant: ')}"

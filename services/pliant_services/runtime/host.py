@@ -197,7 +197,7 @@ def checkpoint_windows(config: Config, fleet: Sequence[str]) -> dict[str, Window
 
 
 def random_delays(largest_ms: float) -> Callable[[], None] | None:
-    """Disturbance of a bus under test: every tenth message waits up to this long."""
+    """For tests of the bus: every tenth message is delayed by up to this long."""
     if largest_ms <= 0.0:
         return None
     random = np.random.default_rng(os.getpid())

@@ -114,5 +114,5 @@ def images_that_wait(bus: Bus) -> int:
 
 
 def readers_that_may_lag(image: Image) -> Collection[str]:
-    """Those that do nothing with a frame, or wait for those that do: it takes no room with them."""
+    """Readers that ignore a frame, or wait for those: it does not count in their windows."""
     return _MAY_LAG if image.unmapped or image.missing else ()

@@ -95,7 +95,7 @@ def whole(image: Image) -> Image:
 
 
 def clearance(image: Image) -> F32 | None:
-    """Of the mask of an image with pixels.  Raises MessageError where it has another size."""
+    """Clearance of the mask of an image with pixels.  Raises MessageError if its size differs."""
     where = f"{topics.IMAGE.key}: frame {image.frame}"
     try:
         found = clearance_in(image.mask)

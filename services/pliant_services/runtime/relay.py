@@ -188,7 +188,7 @@ class Relays:
             self._cameras[name] = camera
             if name in self._relays:
                 self._relays[name].know_camera(camera)
-            while len(self._cameras) > _MOST_SESSIONS:  # of sessions that never were, say
+            while len(self._cameras) > _MOST_SESSIONS:  # for instance of sessions that do not exist
                 del self._cameras[next(iter(self._cameras))]
 
     def _on_token(self, held: dict[str, set[str]], sample: zenoh.Sample) -> None:

@@ -1,5 +1,4 @@
-"""Who may publish what, by the name in the certificate: Zenoh's access control from the one list of
-processes."""
+"""Zenoh's access control: which topics a certificate may publish, by the list of processes."""
 
 from collections.abc import Sequence
 from typing import Any

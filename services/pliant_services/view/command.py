@@ -29,7 +29,7 @@ from pliant.viewers.drawn_scene import Scene
 from pliant.viewers.rerun import RerunCanvas, Where
 from pliant_services.runtime.announced import running_session
 
-_WAITING = 512  # messages between the network and the drawing; the oldest give way
+_WAITING = 512  # messages between the network and the drawing; beyond, the oldest are dropped
 _WAITING_BYTES = 256 << 20
 _ASK_S = 0.5
 _GONE_S = 0.2  # what is on the way when the last service has gone
@@ -248,7 +248,7 @@ def _draw_while(canvas: Canvas, waiting: Backlog, goes_on: Callable[[], bool]) -
 
 
 def _tokens(connection: zenoh.Session, session: str) -> list[str]:
-    """Of the services that are there, those of other versions included."""
+    """Liveliness tokens of all services present, also of other versions."""
     replies = connection.liveliness().get(f"pliant/{session}/ready/**")
     return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 

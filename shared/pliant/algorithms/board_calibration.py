@@ -142,7 +142,7 @@ class BoardFinder:
 
 
 def boards_seen(images: Sequence[U8]) -> list[str]:
-    """In words, which boards the images (H, W) show: for a user who named another."""
+    """Describe the boards that the images (H, W) show, for a user who named another."""
     for name in _LARGEST:
         detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARIES[name]))
         found: list[Any] = [detector.detectMarkers(grey)[1] for grey in images]
@@ -324,7 +324,7 @@ def _minimised(
 
 
 def _jackknifed(views: Sequence[BoardView], fit: _Fit) -> float:
-    """Of the logarithm of the mean focal length; inf where leaving views out leaves no lens."""
+    """Jackknife sigma of the log mean focal length; inf if a fit without some views fails."""
     folds = min(_FOLDS, len(views))
     logs: list[float] = []
     lens = fit.lens

@@ -32,7 +32,7 @@ class Located:
 
 
 class KnownMap:
-    """A map that is kept.
+    """A saved map.
 
     calibration: of the camera of its last session.   keyframes: (N, 4, 4) T_world_camera of them.
     points: (P, 3).   colours: (P, 3) RGB.   segments: (P,) of the points: each is a world of its

@@ -86,7 +86,7 @@ class Result(Mapped):
 
     @property
     def history(self) -> MapHistory:
-        """All segments of the map, with what it knew when."""
+        """All segments of the map and their history."""
         return self._run.history
 
     @cached_property
@@ -116,20 +116,20 @@ class Result(Mapped):
 
     @cached_property
     def calibration(self) -> Calibration | None:
-        """Of the source, with the run's estimate: the content of calibration.yaml."""
+        """The calibration as estimated by the run: the content of calibration.yaml."""
         return found_calibration(self._run)
 
     @cached_property
     def camera(self) -> PinholeCamera:
-        """Of the map: landmarks project into its pixels where ``keyframes`` and ``tracks`` have
-        them, except for the estimated distortion.
+        """The camera of the map: landmarks project to the pixels of ``keyframes`` and ``tracks``,
+        except for the estimated distortion.
         """
         stream, longest = self._stream, self.history.longest_segment()
         return corrected_view(stream.camera, self._run.correction_of(longest)).camera
 
     @cached_property
     def keyframes(self) -> list[Keyframe]:
-        """Of the longest segment, in order of time."""
+        """The keyframes of the longest segment, in order of time."""
         longest = self.history.longest_segment()
         here = {n: k for n, k in self.history.keyframes.items() if k.segment == longest}
         own = {number: keyframe for number, keyframe in here.items() if keyframe.frame >= 0}
@@ -165,7 +165,7 @@ class Result(Mapped):
         return grey if colour is None else colour
 
     def surfels(self) -> Iterator[Surfels]:
-        """Of a scene that deforms: its surfels in every frame."""
+        """The surfels of a deforming scene, in every frame."""
         return recorded_surfels(self._recording.path)
 
     def picture(self, width: int = 960, height: int = 720) -> U8:
@@ -184,7 +184,7 @@ class Result(Mapped):
         return f"<pliant.Result {str(self.path)!r}: {len(self.trajectory)} poses>"
 
     def _repr_html_(self) -> str:
-        """For a notebook: the verdict and a picture."""
+        """Show the verdict and a picture in a notebook."""
         lines = summary(self.report, has_map=not self.is_deformable)
         text = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
         if self.is_deformable or not len(self.trajectory):

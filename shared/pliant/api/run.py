@@ -119,6 +119,6 @@ def run(
 
 
 def _told(line: str) -> tuple[int, F64 | None]:
-    """Of a line of ``--poses``: the number of a frame, and its pose (4, 4) where it has one."""
+    """Parse a line of ``--poses``: the number of a frame, and its pose (4, 4) or None."""
     _, frame, _, *pose = line.split()
     return int(frame), pose_to_matrix(np.array(pose, np.float64)) if pose else None

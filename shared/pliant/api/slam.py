@@ -19,7 +19,7 @@ from pliant.map_history import MapHistory
 from pliant.offline import Pipeline
 
 _FPS = 30.0
-"""Of images that come without a time."""
+"""Frames per second of images without a time."""
 
 
 class Slam(Mapped):
@@ -80,7 +80,7 @@ class Slam(Mapped):
     def take(
         self, image: U8, stamp: float | None = None, mask: U8 | BoolArray | None = None
     ) -> "Tracked":
-        """As ``track``, with all that is known of the image."""
+        """As ``track``; returns the tracks and the reason for a missing pose as well."""
         number, last_ns = self._next.index, self._next.stamp_ns
         stamp_ns = round(1e9 * (number / _FPS if stamp is None else stamp))
         if stamp_ns <= last_ns:

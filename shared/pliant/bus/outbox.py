@@ -166,7 +166,7 @@ class Outbox:
         return 0 if reader is None else max(0, self.sent - reader.taken)
 
     def _light(self, reader: Reader) -> int:
-        """How many of those take no room in its window."""
+        """Number of those that do not count towards its window."""
         return len(reader.light) - bisect_left(reader.light, reader.taken)
 
     def on_the_way(self) -> int:

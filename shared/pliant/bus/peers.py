@@ -1,4 +1,4 @@
-"""Who else is in the session, by the liveliness tokens of its services.
+"""The other services in the session, by their liveliness tokens.
 
 A token says ``ready/<service>/<incarnation>/<wire version>/<release>+<schema>``.  The incarnation
 tells one start of a service from the next, so that the late end of an old token is not taken for
@@ -15,9 +15,9 @@ from pliant.messages.topics import TOPICS, status
 from pliant.version import __version__
 
 WIRE_VERSION = 5
-"""Of envelopes and credits; services of different ones refuse each other."""
+"""Version of envelopes and credits; services of different versions refuse each other."""
 SCHEMA = codec.schema_hash([topic.message for topic in (*TOPICS, status("*"))])
-"""Of what messages hold: with other fields a message would be read, and not say the same."""
+"""Hash of the messages' fields: with other fields a message would be misread."""
 
 STOP_KEY, OVER_KEY = "control/stop", "control/over"
 """The keys of announcements to a whole session, without its prefix: to end, and ended."""
@@ -60,7 +60,7 @@ class Peers:
     service: str
     incarnation: int
     needed: Collection[str] = ()
-    """Those that we read from, or that read from us."""
+    """Services that we read from, or that read from us."""
     here: dict[str, set[int]] = field(default_factory=dict[str, set[int]])
     gone_since: dict[str, float] = field(default_factory=dict[str, float])
     met: dict[str, set[int]] = field(default_factory=dict[str, set[int]])
@@ -120,24 +120,24 @@ class Peers:
         return all(self.here.get(name) or name in self.gone_since for name in names)
 
     def expect(self, names: Iterable[str], now: float) -> None:
-        """Those that were here before we came count as gone from now on, until they are seen."""
+        """Count services that were here before us as absent until their token appears."""
         for name in names:
             if not self.here.get(name):
                 self.gone_since.setdefault(name, now)
 
     def missing(self, names: Iterable[str]) -> list[str]:
-        """Those that are not here now, sorted."""
+        """Absent services, sorted."""
         return sorted(name for name in names if not self.here.get(name))
 
     def absent(self, names: Iterable[str]) -> str:
-        """Those that are not here now in words: "tracking (away)"; "" while all are."""
+        """Absent services as text: "tracking (away)"; "" if all are present."""
         missing = dict.fromkeys(self.missing(names))
         return ", ".join(
             f"{name} ({'away' if name in self.gone_since else 'not here yet'})" for name in missing
         )
 
     def lost(self, names: Iterable[str], *, patience_s: float, now: float) -> list[str]:
-        """Those that have been gone for longer than we wait, sorted."""
+        """Services absent for longer than we wait, sorted."""
         gone = self.gone_since
         return sorted(name for name in names if name in gone and now - gone[name] >= patience_s)
 

@@ -37,7 +37,7 @@ class Waiting:
         self.text = ""
 
     def told(self, now: float) -> str:
-        """The wait in words, with its length once that is long; "" without one."""
+        """A description of the wait, with its length if it is long; "" without one."""
         waited_s = now - self.since
         if not self.text or waited_s < _WORTH_TELLING_S:
             return self.text

@@ -315,7 +315,7 @@ class ZenohBus:
     def _take(
         self, entries: Sequence[InLink], timeout_s: float | None = None, *, views: bool = False
     ) -> Received | None:
-        """The next message, looked into: what does not fit its topic is passed over."""
+        """The next valid message; malformed ones are skipped."""
         self._disturb()
         deadline = time.monotonic() + timeout_s if timeout_s is not None else None
         while True:
@@ -361,7 +361,7 @@ class ZenohBus:
         return state
 
     def start_from(self, taken: Mapping[str, int], ended: Collection[str]) -> None:
-        """For a service that keeps its own books: take up each input where it left it."""
+        """Resume each input where a service that keeps its own books left it."""
         for key in ended:
             self._inputs[key].ended = True
         self._start_from(Place(-1, taken, {}))

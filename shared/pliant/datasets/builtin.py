@@ -45,7 +45,6 @@ __all__ = [
     "builtin_folder",
     "is_deforming",
     "parse_builtin",
-    "render_sequence",
 ]
 
 Options = SequenceOptions | DeformingOptions
@@ -74,7 +73,9 @@ def parse_builtin(source: str) -> tuple[str, Options]:
     Raises DatasetError that lists the valid names or options.
     """
     name, _, query = source.removeprefix(PREFIX).partition("?")
-    _check_name(name)
+    if name not in SCENES and name not in DEFORMING:
+        valid = ", ".join(PREFIX + known for known in (*SCENES, *DEFORMING))
+        raise DatasetError(f"{PREFIX}{name}: no such built-in sequence; valid: {valid}")
     kind: type[Parameters] = DEFORMING[name].options if name in DEFORMING else SequenceOptions
     given: dict[str, Any] = {}
     for item in filter(None, query.split("&")):
@@ -99,19 +100,18 @@ def parse_builtin(source: str) -> tuple[str, Options]:
 
 def builtin_folder(
     source: str,
-    options: Options | None = None,
     *,
     cache: Path | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """The folder of a built-in sequence, rendered now if the cache does not hold it.
 
-    source: ``built-in:NAME?...`` or a bare name; ``options`` replace those in the source.
+    source: ``built-in:NAME?...`` or a bare name.
     A rendering that is interrupted leaves nothing behind that could be taken for a sequence, and
     two processes that want the same sequence render it once.
     """
-    name, parsed = parse_builtin(source)
-    plan = _plan(name, options or parsed)
+    name, options = parse_builtin(source)
+    plan = _plan(name, options)
     text = json.dumps(plan.description(), sort_keys=True)
     root = (cache or cache_folder()) / "sequences"
     folder = root / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
@@ -128,32 +128,6 @@ def builtin_folder(
             "free some space or set PLIANT_CACHE_DIR to another folder"
         ) from error
     return folder
-
-
-def render_sequence(
-    name: str,
-    output: Path,
-    options: Options | None = None,
-    *,
-    progress: Progress | None = None,
-) -> Path:
-    """Render a sequence into a new folder ``output``.  DatasetError if that exists already."""
-    if output.exists():
-        raise DatasetError(f"{output}: already exists; choose another folder, or remove it")
-    _check_name(name)
-    plan = _plan(name, options or parse_builtin(name)[1])
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        _render_beside(plan, output, progress)
-    except OSError as error:
-        raise DatasetError(f"{output}: cannot write ({error.strerror or error})") from error
-    return output
-
-
-def _check_name(name: str) -> None:
-    if name not in SCENES and name not in DEFORMING:
-        valid = ", ".join(PREFIX + known for known in (*SCENES, *DEFORMING))
-        raise DatasetError(f"{PREFIX}{name}: no such built-in sequence; valid: {valid}")
 
 
 def _plan(name: str, options: Options) -> _Plan:

@@ -51,7 +51,7 @@ def read_calibration(
 
 
 def file_and_camera(file: Path) -> tuple[Path, str]:
-    """Of ``FILE:cam1`` the file, and the camera that is named; "" where none is."""
+    """The file and the camera of ``FILE:cam1``; "" if no camera is named."""
     named = _CAMERA.fullmatch(str(file))
     if named is None or file.exists() or not Path(named[1]).exists():
         return file, ""

@@ -48,7 +48,7 @@ def flat_keys(text: str, wanted: Wanted) -> Keys:
 
 
 def flat_from_keys(content: Keys, wanted: Wanted) -> Keys:
-    """Of what has keys already.  Raises CalibrationError."""
+    """Convert a file that is already keys and values.  Raises CalibrationError."""
     for kind in FORMATS:
         if not isinstance(kind.mark, re.Pattern) and any(key in content for key in kind.mark):
             return kind.flat(content, wanted)

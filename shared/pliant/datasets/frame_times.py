@@ -52,7 +52,7 @@ def in_order(frames: Iterable[SourceFrame], *, ahead: bool = True) -> Iterator[S
     """
     last_ns, step_ns, waiting = -1, 1, list[SourceFrame]()
     for frame, good in _marked(frames, ahead=ahead):
-        if not good or frame.stamp_ns - last_ns <= len(waiting):  # no room for those between
+        if not good or frame.stamp_ns - last_ns <= len(waiting):  # no time for the frames between
             waiting.append(frame)
             continue
         yield from _between(waiting, last_ns, (frame.stamp_ns - last_ns) // (len(waiting) + 1))

@@ -85,7 +85,7 @@ class RecordedFrames:
 
 
 def recorded_frame(image: SourceImage, depth: bytes = b"") -> SourceFrame:
-    """The frame that the source gave, of an image that has its pixels (``RecordedImages``)."""
+    """The source's frame of an image with pixels (``RecordedImages``)."""
     assert image.data or image.clip_frame < 0, "an image whose pixels are still in its clip"
     return SourceFrame(
         index=image.frame,

@@ -26,7 +26,7 @@ from pliant.ros.graph import Node, RosTopic
 
 _PREFIX = "ros:"
 _PORT = 7447
-_WAITING = 16  # messages between the network and the reader; the oldest give way
+_WAITING = 16  # messages between the network and the reader; beyond, the oldest are dropped
 _FIRST_S = 10.0  # for the first message of a topic
 _ASK_S = 0.5
 
@@ -58,7 +58,7 @@ class RosCamera(MessageImages):
                 self.notes.append(str(error))
 
     def heard(self) -> Measurements:
-        """What other sensors have measured since the images are read."""
+        """Measurements of other sensors since the first image."""
         try:
             return sensors_of(self._heard, self._spec)
         except DatasetError as error:

@@ -43,7 +43,7 @@ class SourceSpec(BaseModel):
         return self
 
     def to_json(self) -> str:
-        """For ``parse``; by the standard library, which keeps file names that are not UTF-8."""
+        """JSON for ``parse``, by the standard library: it keeps file names that are not UTF-8."""
         return json.dumps(self.model_dump(exclude_defaults=True), default=str)
 
     @classmethod

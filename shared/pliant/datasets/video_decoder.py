@@ -20,7 +20,7 @@ from pliant.errors import DatasetError
 
 _DEFAULT_FPS = 30.0
 _MOST_LINES = 1088
-"""Of interlaced video."""
+"""Maximum lines of interlaced video."""
 _LOOKED_AT = 8
 """Pictures by which a stream counts as interlaced or not."""
 _SAME_ASPECT = 0.01
@@ -166,7 +166,7 @@ def _packets(
 ) -> cv2.VideoCapture | None:
     """The packets of a stream, if they can be decoded one by one.
 
-    Of a container that is not understood they are those of what FFmpeg takes for its best stream.
+    If the container is unknown, they are those of FFmpeg's choice of the best stream.
     """
     if not decodes(codec_of(capture)):
         return None

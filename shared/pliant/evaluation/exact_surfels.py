@@ -272,7 +272,7 @@ class ExactSurfels:
         return out
 
     def by_sheet(self) -> dict[str, tuple[int, float]]:
-        """Of each sheet the number of surfels born on it and their RMSE by depth while alive."""
+        """For each sheet, the number of its surfels and their relative RMSE while alive."""
         assert self._start is not None
         if not self._pairs.squares:
             return {}

@@ -134,7 +134,6 @@ def evaluate_trajectory(
     frames: int | None = None,
     other_segments: Sequence[int] = (),
     origin_ns: int | None = None,
-    max_difference_ns: int = MAX_DIFFERENCE_NS,
 ) -> TrajectoryEvaluation:
     """Compare an estimate with ground truth; see TrajectoryEvaluation for what counts.
 
@@ -146,7 +145,7 @@ def evaluate_trajectory(
     if frames is not None and poses > frames:
         raise ResultError(f"{poses} poses for a sequence of {frames} frames")
     part = estimate
-    a, b = associate(part.stamps_ns, truth.stamps_ns, max_difference_ns=max_difference_ns)
+    a, b = associate(part.stamps_ns, truth.stamps_ns)
     matched, true_part = part.select(a), truth.select(b)
 
     alignment, errors, reason = None, np.zeros(0), ""
@@ -156,7 +155,7 @@ def evaluate_trajectory(
         errors = absolute_errors(aligned, true_part.T_world_camera)
     except ValueError as error:
         aligned = matched.T_world_camera
-        reason = _no_alignment(str(error), part, len(a), max_difference_ns)
+        reason = _no_alignment(str(error), part, len(a))
     rate = None if not frames else len(part) / frames
     success = None if rate is None else rate >= MIN_SUCCESS
     if rate is not None and not success and len(part):
@@ -187,11 +186,11 @@ def evaluate_trajectory(
     )
 
 
-def _no_alignment(why: str, part: Trajectory, matched: int, max_difference_ns: int) -> str:
+def _no_alignment(why: str, part: Trajectory, matched: int) -> str:
     if not len(part):
         return "no frame was localised"
     if matched < MIN_POSES:
-        limit = max_difference_ns / 1e9
+        limit = MAX_DIFFERENCE_NS / 1e9
         return f"only {matched} of {len(part)} poses have a ground-truth pose within {limit:g} s"
     return why
 

@@ -22,7 +22,7 @@ _GATES = (0.05, 0.01)
 """Shares of the diameter within which ICP takes points for the same, one after the other."""
 _ITERATIONS = 40
 _SAMPLES = 10_000
-"""Of the mesh that ICP moves."""
+"""Samples of the mesh that ICP moves."""
 _SETTLED = 1e-5
 """Share of the diameter by which an iteration moves the samples when it is the last."""
 _LABELS = {

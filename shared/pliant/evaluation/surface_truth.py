@@ -74,7 +74,7 @@ class SurfaceTruth:
         return out
 
     def visible(self, points: MaterialPoints, frame: int, margin_px: float = 0.0) -> BoolArray:
-        """(N,) whether they are in the image, so far from its border, and nothing hides them."""
+        """(N,) whether points are in the image, this far from its border, and not occluded."""
         T_camera_world = inverse(self.T_world_camera[frame])
         positions = transform(T_camera_world, self.positions(points, frame))
         front = positions[:, 2] > 0.0

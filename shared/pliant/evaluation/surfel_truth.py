@@ -153,12 +153,12 @@ def cloud_of(depth_m: F64, camera: PinholeCamera) -> F64:
 
 
 def rmse(errors: F64) -> float:
-    """Of (N, 3) vectors; NaN without any."""
+    """RMSE of (N, 3) error vectors; NaN without any."""
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))) if len(errors) else float("nan")
 
 
 def trimmed_rmse(errors: F64, share: float) -> float:
-    """Of the smallest share of (N,) errors."""
+    """RMSE of the smallest share of (N,) errors."""
     kept = np.sort(np.abs(errors))[: int(share * len(errors))]
     return float(np.sqrt(np.mean(kept**2))) if len(kept) else float("nan")
 

@@ -100,7 +100,7 @@ def _longest_segment(recording: Recording) -> tuple[int, I64]:
 
 
 def _filled(positions: F64) -> F64:
-    """(K, N, 3) with the last position that is finite, before the first of them with the first."""
+    """(K, N, 3) with gaps filled by the last finite position, or by the first at the start."""
     keys = np.arange(len(positions))[:, None]
     found = np.isfinite(positions[..., 0])
     last = np.maximum.accumulate(np.where(found, keys, -1), axis=0)

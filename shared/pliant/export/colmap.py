@@ -55,7 +55,7 @@ def seen_model(
     recording: Recording, ideal: IdealCamera, images: list[PosedImage], points: Points,
     crop: Box | None = None,
 ) -> tuple[list[ColmapImage], I64]:  # fmt: skip
-    """The images with the points that they see, and (K,) rows of the points that two of them see.
+    """The images with their points, and (K,) rows of the points that two of them observe.
 
     Points of an image are numbers of those rows.    crop: only points in this box.
     """
@@ -86,7 +86,7 @@ def _sights(
     ids: I64,
     positions: F64,
 ) -> list[tuple[F64, I64]]:
-    """For each image the (N, 2) pixels at which it sees points and the (N,) rows of those.
+    """The (N, 2) pixels of the points that each image observes, and the (N,) rows of those.
 
     seen: by the id of the keyframe.    ids: (P,) of the points, ascending.    positions: (P, 3).
     """
@@ -137,7 +137,7 @@ def _owners(
 def _inliers(
     ideal: IdealCamera, image: PosedImage, pixels: F64, rows: I64, positions: F64
 ) -> tuple[F64, I64]:
-    """Those of the pixels (N, 2) in the image that are where it sees the point, each point once."""
+    """The pixels (N, 2) near the projection of their point, each point once."""
     T = inverse(image.T_world_camera)
     local = positions[rows] @ T[:3, :3].T + T[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):

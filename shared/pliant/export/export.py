@@ -55,7 +55,7 @@ from pliant.staging import put_tree_in_place, staging
 from pliant.trajectory import Trajectory
 
 _QUALITY = 60
-"""Of the overview: 300 frames stay below 3 MB."""
+"""Quality of the overview: 300 frames stay below 3 MB."""
 
 Export = Callable[..., None]
 """Writes to a path what a recording holds: the recording, the path, the folder if it is that of a
@@ -233,7 +233,7 @@ def _overview(recording: Recording, path: Path, folder: Path | None) -> None:
 
 
 def _informative_frame(run: Run, what: Made) -> int:
-    """Of the frames that the map explains well, the one that looks at the middle of it."""
+    """Of the frames that fit the map well, the one that looks at its centre."""
     final, longest = run.history.final(), run.history.longest_segment()
     frames = [frame for frame, (segment, _) in sorted(final.items()) if segment == longest]
     T_world_camera = pose_to_matrix(np.array([final[frame][1] for frame in frames]))

@@ -31,7 +31,7 @@ from pliant.recording.reader import Recording
 
 
 class ShownView:
-    """What a lens has shown of the images of a corrected view: none of the border that is made up.
+    """The part of a corrected view's images that the lens has shown, without extrapolated borders.
 
     camera: that of the images.
     """
@@ -116,7 +116,7 @@ class RectifiedImage(NamedTuple):
 def rectified_images(
     recording: Recording, stream: CameraStream, wanted: Container[int] | None = None
 ) -> Iterator[RectifiedImage]:
-    """Those of all frames that have pixels, one after the other.
+    """Yield the images of all frames with pixels.
 
     wanted: the numbers of those that are; None: all.
     Raises ResultError where the recording has no images.

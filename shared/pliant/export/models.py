@@ -58,7 +58,7 @@ def rerun(recording: Recording, path: Path, folder: Path | None) -> None:
 
 
 def ply(recording: Recording, path: Path, folder: Path | None, crop: Box | None = None) -> None:
-    """The points of the longest segment.  crop: those in this box."""
+    """The points of the longest segment.  crop: only points in this box."""
     history = read_run(recording.path).history
     points = history.points_in(history.longest_segment())
     if not len(points):

@@ -20,7 +20,7 @@ from pliant.pictures.overlay import OverlayFrame, TrackPainter
 
 FPS = 10.0
 FRAMES = 30
-"""Of the run that are shown."""
+"""Number of frames of the run that are shown."""
 _SWING, _FADE = 36, 4
 """Pictures of the swing, and of the way from one kind of picture to the next."""
 _SWING_DEG = 45.0

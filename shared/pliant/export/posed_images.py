@@ -37,7 +37,7 @@ from pliant.recording.reader import Recording
 from pliant.results.run import Run
 
 INLIER_PX = 1.5
-"""Of the mapper."""
+"""The mapper's limit."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def write_posed_images(
 def _sharpest(
     recording: Recording, stream: CameraStream, ideal: IdealCamera
 ) -> Iterator[RectifiedImage]:
-    """Of the frames that are taken."""
+    """Yield the images of the chosen frames."""
     keyframes = np.array(list(ideal.keyframes))
     between = 0.5 * (keyframes[1:] + keyframes[:-1])
     group, best, chosen = -1, 0.0, None

@@ -33,11 +33,11 @@ from pliant.results.run import Run, read_run
 
 _CLOUD = f"{MODEL}/points3D.ply"
 _MOST_POINTS = 200_000
-"""Of the dense points: trainers add more where they need them."""
+"""Maximum number of dense points: trainers add more where they need them."""
 _REACH_VOXELS = 4.0
 """The truncation of the TSDF: so near to the mesh a point of the map is on the same surface."""
 _COMPARED_POINTS = 4096
-"""Of the map, to find near-duplicate views."""
+"""Points of the map that are compared to find near-duplicate views."""
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ def colours_at(pixels: U8, points_px: F32) -> U8:
 
 
 def overlay_pictures(recording: Recording) -> Iterator[U8]:
-    """Each frame with its surfels, in the colours of the viewers: how each of them fares."""
+    """Each frame with its surfels, coloured by state as in the viewers."""
     stream = camera_of(recording)
     images = rectified_images(recording, stream)
     states = {

@@ -45,7 +45,7 @@ def surfel_tracks(recording: Recording, path: Path, folder: Path | None, every: 
 
 
 def _frames(recording: Recording, every: int) -> Iterator[Surfels]:
-    """Those that have surfels."""
+    """Yield the frames with surfels."""
     for surfels in recorded_surfels(recording.path):
         if not surfels.missing and surfels.frame % every == 0:
             yield surfels

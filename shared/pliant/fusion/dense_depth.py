@@ -39,7 +39,7 @@ _SOURCES, _NEIGHBOURS = 4, 12
 _RECENT = 64
 """Keyframes swept last, of which the live mesh takes its sources: constant time per keyframe."""
 _FIRST_ID = 2**30
-"""Of pixels as points: beyond all points of the map."""
+"""First id of pixels that are used as points: beyond all points of the map."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class DenseDepths:
         self._taken[keyframe] = _Taken(T_world_camera, some, sharpness(grey))
 
     def sweep(self, seen: Iterable[tuple[int, SeenPoints]], timer: StageTimer = no_stages) -> None:
-        """The first pass, when all are taken: of keyframes and what each sees."""
+        """The first pass, over all keyframes and the points that each observes."""
         known = ((keyframe, points) for keyframe, points in seen if keyframe in self._taken)
         results = in_order(self._swept, known, self._workers)
         while True:
@@ -181,7 +181,7 @@ class DenseDepths:
     def with_sure_pixels(
         self, keyframe: int, seen: SeenPoints, agreed: DenseDepth | None
     ) -> SeenPoints:
-        """What a keyframe sees, and the pixels that are sure."""
+        """The points that a keyframe observes, and its certain pixels."""
         if agreed is None:
             return seen
         view = self._view(keyframe)
@@ -218,7 +218,7 @@ class DenseDepths:
         return swept_depth(self._view(keyframe), sources, self._anchors(keyframe, seen))
 
     def agreed_on(self, keyframe: int) -> DenseDepth | None:
-        """What a keyframe and those around it agree on; None: nothing."""
+        """The depth on which a keyframe and its neighbours agree, or None."""
         around = self._around.get(keyframe, [])
         if not around:
             return None

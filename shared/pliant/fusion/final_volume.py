@@ -42,22 +42,22 @@ class FinalVolume:
 
     @property
     def memory_bytes(self) -> int:
-        """Of the voxels, but for what is on disk."""
+        """Memory of the voxels, without those on disk."""
         return self.volume.memory_bytes if self.file_bytes == 0 else 0
 
     @property
     def file_bytes(self) -> int:
-        """Of the voxels on disk."""
+        """Size of the voxels on disk."""
         return self._file.size_bytes
 
     @property
     def most_bytes(self) -> int:
-        """What there is room for."""
+        """Maximum size on disk."""
         return self._file.most * BLOCK_BYTES
 
     @property
     def needed_bytes(self) -> int:
-        """What all that was put in takes, where it is full."""
+        """Size that the volume would need, if it is full."""
         return len(self._needed) * BLOCK_BYTES
 
     def put(self, depth_map: DepthMap, colour: U8, T_world_camera: F64) -> None:

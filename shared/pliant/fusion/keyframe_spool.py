@@ -109,7 +109,7 @@ class KeyframeSpool:
         return ids, pixels.reshape(-1, 2).copy()
 
     def surface(self, keyframe: int) -> DrawnTriangles:
-        """What a keyframe's depth map shows.  KeyError without any."""
+        """The triangles of a keyframe's depth map.  KeyError without any."""
         raw = self._read(self._surfaces[keyframe])
         count = int(np.frombuffer(raw, np.int64, 1)[0])
         corners = np.frombuffer(raw, np.float32, 4 * count, _ID_BYTES).reshape(-1, 4)

@@ -21,7 +21,7 @@ _SAMPLES = 32
 
 @dataclass(frozen=True)
 class Sight:
-    """What a keyframe gives to the volume.  colour: (H, W, 3) RGB.    T_world_camera: (4, 4)."""
+    """A keyframe's part of the volume.  colour: (H, W, 3) RGB.    T_world_camera: (4, 4)."""
 
     depth_map: DepthMap
     colour: U8

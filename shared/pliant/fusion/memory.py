@@ -13,7 +13,7 @@ from pliant.algorithms.meshing.parameters import TsdfParameters
 from pliant.errors import PliantError
 
 _GROWTH = 0.6
-"""Of surface, blocks grow with one over the voxel squared; at its borders more slowly."""
+"""Blocks of a surface grow with one over the voxel squared; at its borders more slowly."""
 _MARGIN = 1.05
 """On a voxel that is proposed as fitting."""
 SCENE_VIEWS = 20

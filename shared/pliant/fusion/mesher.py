@@ -156,7 +156,7 @@ class Mesher:
         self._corrections[segment] = left
 
     def _left_of(self, correction: tuple[float, ...]) -> tuple[float, ...]:
-        """What of a correction is left beside the pinhole that was frozen."""
+        """The rest of a correction relative to the frozen pinhole."""
         s, k1, k2, a, b, t = parts_of(correction)
         s0, _, _, a0, b0, t0 = self._frozen
         across, down = float(np.exp(s0 - s)), float(np.exp(s0 + t0 - s - t))
@@ -204,7 +204,7 @@ class Mesher:
 
     @property
     def behind(self) -> int:
-        """Keyframes that the live mesh lacks, or has elsewhere than the map: ``fuse`` takes one."""
+        """Keyframes that the live mesh lacks or has at an old pose: ``fuse`` takes one."""
         return len(self._again)
 
     @property
@@ -271,7 +271,7 @@ class Mesher:
         self._live_dense.add(keyframe, self._seen(keyframe), usable, timer)
 
     def _with_dense(self, keyframe: int, seen: SeenPoints, timer: StageTimer) -> SeenPoints:
-        """What a keyframe sees, and what it and those swept before it agree on."""
+        """The points of a keyframe, and the pixels on which it and earlier swept ones agree."""
         if not self._live_dense.is_swept(keyframe):
             return seen
         with timer("dense consensus"):
@@ -370,7 +370,7 @@ class Mesher:
             dense.take(keyframe, self._pose(keyframe), points, grey_of(colour), shown)
 
     def _median_depth(self, keyframes: list[int]) -> float:
-        """Of the points that the keyframes see, the median of their medians."""
+        """Median over the keyframes of the median depth of their points."""
         medians: list[float] = []
         for keyframe in keyframes:
             T = self._pose(keyframe)
@@ -384,7 +384,7 @@ class Mesher:
     def _within(
         self, keyframe: int, depth_map: DepthMap, correction: tuple[float, ...]
     ) -> DepthMap:
-        """Without what the mask of a keyframe covers."""
+        """The depth map without the pixels that the keyframe's mask covers."""
         used = unmasked(self._spool.mask(keyframe), view_of(self._camera, correction))
         return depth_map if used is None else depth_map.within(used)
 

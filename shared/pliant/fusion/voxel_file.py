@@ -21,11 +21,11 @@ _GROWTH = 1.25
 _COPIED = 4096
 """Blocks at a time, when memory is full of them."""
 _SHARE_OF_FREE = 0.5
-"""Of the disk, at the most: others need some, too."""
+"""Maximum share of the free disk: other programs need some, too."""
 
 
 class VoxelFile(InMemory):
-    """A context manager.  The files have no name: they are gone with the process.
+    """A context manager.  The files have no name and vanish with the process.
 
     size_bytes: of the files, 0 while all is in memory.
     """

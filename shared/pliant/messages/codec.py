@@ -184,7 +184,7 @@ def _array(message: type, spec: ArrayField, value: Any, sizes: dict[str, int], l
         raise MessageError(f"{where}: {len(raw)} bytes do not fill shape {shape} of {spec.dtype}")
     try:
         return np.frombuffer(raw, spec.dtype).reshape(shape)
-    except (ValueError, OverflowError):  # an empty array with a side beyond all sizes
+    except (ValueError, OverflowError):  # an empty array with an impossibly long side
         raise MessageError(f"{where}: bad shape {str(shape)[:80]}") from None
 
 

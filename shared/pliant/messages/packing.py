@@ -15,7 +15,7 @@ from pliant.errors import MessageError
 from pliant.messages.zstd import compress
 
 CODE = 1
-"""Of the msgpack extension."""
+"""Code of the msgpack extension."""
 
 _HEADER = struct.Struct("<QQ")  # bytes when unpacked, bytes of a row (0: they are no rows)
 _LEVEL = 1

@@ -14,7 +14,7 @@ from pliant.algorithms.arrays import U8, array_fields
 from pliant.errors import MessageError
 
 CODE = 2
-"""Of the msgpack extension."""
+"""Code of the msgpack extension."""
 
 _LEAST_BYTES = 1024  # below that there is nothing to gain
 

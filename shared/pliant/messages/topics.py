@@ -96,7 +96,7 @@ TOPICS = (
     KEYFRAME, KEYFRAME_FINAL, MAP_KEPT, MESH_BLOCKS, MESH_FINAL, SURFELS, STREAM_END,
 )  # fmt: skip
 WITH_PIXELS = (IMAGE, SOURCE)
-"""Those that are made smaller for a link between machines."""
+"""Topics that are compressed for a link between machines."""
 VIEWED = tuple(topic for topic in TOPICS if topic.viewed)
 _BY_KEY = {topic.key: topic for topic in TOPICS}
 

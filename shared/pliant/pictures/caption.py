@@ -15,7 +15,7 @@ _INK = (235, 235, 235)
 _TEXT = 0.6
 """Height of the letters with what reaches above and below the line, as a share of the bar's."""
 _HERSHEY_PX = 30.0
-"""That height of OpenCV's plain letters at scale 1."""
+"""Height of OpenCV's plain letters at scale 1."""
 _ENDLESS = (1 << 20, 1)  # a picture in which no line breaks
 
 

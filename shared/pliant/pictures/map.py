@@ -12,9 +12,9 @@ from pliant.algorithms.image.splats import draw_discs
 BACKGROUND = (16, 19, 24)
 PATH_COLOUR = (255, 150, 40)
 PLACES_COLOUR = (90, 220, 110)
-"""Of lines between what shows one place."""
+"""Colour of lines between keyframes of one place."""
 _DOT = 0.008
-"""Of the picture's rows: radius of the dots at their ends, which may lie in one place."""
+"""Radius of the dots at their ends, which may coincide, as a share of the picture's rows."""
 
 FOCAL = 1.2  # of the height of the picture
 _ASPECT = 4.0 / 3.0

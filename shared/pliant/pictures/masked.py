@@ -6,7 +6,7 @@ from pliant.algorithms.arrays import U8, BoolArray
 from pliant.algorithms.image.masks import unpacked
 
 _BRIGHTNESS = 0.3
-"""Of what is not used: it is seen what was left out."""
+"""Brightness of masked parts, which stay visible."""
 
 
 def dimmed(image: U8, used: BoolArray | None) -> U8:

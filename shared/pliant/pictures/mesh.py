@@ -28,7 +28,7 @@ _CLAY = 235.0
 _LAMP = np.array([-0.43, -0.72, -0.55])
 _AMBIENT, _FROM_EYE, _FROM_LAMP = 0.28, 0.3, 0.55
 _OWN_LIGHT = 0.5
-"""Of the colours, which have seen the scene's own light: so much of them needs no lamp."""
+"""Share of the colours that needs no lamp, because they contain the scene's own light."""
 _BRIGHT = 1.1
 """Factor of the lamps on the rest: white stays white."""
 
@@ -135,7 +135,7 @@ def _towards(mesh: TriangleMesh, view: MapView) -> BoolArray:
 
 
 def _parts(mesh: TriangleMesh) -> list[slice]:
-    """Of its triangles: in memory there are millions of them, but few of what is in between."""
+    """Slices of the triangles, of which there may be millions, to bound temporary arrays."""
     return [slice(first, first + _ROWS) for first in range(0, len(mesh.triangles), _ROWS)]
 
 

@@ -114,7 +114,7 @@ def _call_webm(matroska: Path) -> None:
 
 
 def animation_suffix(path: Path) -> str:
-    """That of an animation; ResultError for another one."""
+    """The suffix of an animation; raises ResultError for any other."""
     suffix = path.suffix.lower()
     if suffix not in _ANIMATIONS:
         raise ResultError(f"{path}: unknown kind of animation; use {', '.join(_ANIMATIONS)}")

@@ -29,7 +29,7 @@ _LARGEST_DOT = 0.003
 """Radius, as a share of the width: of few tracks, too, the image stays visible."""
 _TRAIL_WIDTH = 0.0009
 _BRIGHTNESS, _SATURATION = 0.85, 0.75
-"""Of the image under the marks, so that their colours stand out."""
+"""Brightness and saturation of the image under the marks, so that their colours stand out."""
 _GOLDEN = 0.6180339887498949
 
 

@@ -22,7 +22,7 @@ from pliant.recording.scan import Damage, StoredMessage, scan_chunk
 
 @dataclass(frozen=True)
 class IndexedChunk:
-    """One chunk.  topics: whose messages are in it.  start_ns, end_ns: their log times."""
+    """One chunk.  topics: of its messages.  start_ns, end_ns: their log times."""
 
     number: int
     file: Path

@@ -75,7 +75,7 @@ class MapFile:
     def keyframes(self) -> Iterator[MapKeyframe]:
         """The keyframes, oldest first.  Raises MapError for a file that is damaged or cut off,
         and for a map in which no place could be recognised."""
-        # It loads kernels, and services that only look for their map need none.
+        # Loads kernels, which services that only look for their map do not need.
         from pliant.algorithms.slam.store.kept_map import check
 
         last, places = -1, 0

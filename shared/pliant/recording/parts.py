@@ -55,13 +55,6 @@ def exists(path: Path) -> bool:
     return bool(parts_of(path))
 
 
-def remove(path: Path) -> None:
-    """Delete a recording, in one file or in parts.  Nothing else is touched."""
-    path.unlink(missing_ok=True)
-    for part in parts_in(folder_of_parts(path)):
-        part.unlink()
-
-
 class RollingWriter:
     """A RecordingWriter that begins a new file whenever one is large or old enough.
 

@@ -84,7 +84,7 @@ class Summary:
 
     @property
     def repeated(self) -> int:
-        """Messages that are there more than once, over all topics."""
+        """Number of duplicate messages in all topics."""
         return sum(topic.repeated for topic in self.topics.values())
 
     @property
@@ -195,7 +195,7 @@ def _missing(topic: TopicSummary) -> str:
 
 
 def in_words(count: int) -> str:
-    """That many bytes."""
+    """A number of bytes, with its unit."""
     if count < 1 << 10:
         return f"{count} B"
     return f"{count / (1 << 20):.1f} MiB" if count >= 1 << 20 else f"{count / (1 << 10):.1f} KiB"

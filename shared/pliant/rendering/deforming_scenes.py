@@ -64,7 +64,7 @@ class DeformingOptions(FilmOptions):
 
 
 class PaperOptions(DeformingOptions):
-    """Of the Kinect paper."""
+    """Options of the Kinect paper."""
 
     tracks: str | None = Field(
         default=None, description="mdh_23frames_301pts.npz: the true points of the paper."
@@ -72,7 +72,7 @@ class PaperOptions(DeformingOptions):
 
 
 class StretchingOptions(DeformingOptions):
-    """Of the sheet that stretches."""
+    """Options of the stretching sheet."""
 
     stretch: float = Field(
         default=0.2, ge=0.0, le=0.5, description="Greatest strain along x: 0.2 is 20 %."
@@ -90,7 +90,7 @@ class StretchingOptions(DeformingOptions):
 
 
 class BreathingOptions(DeformingOptions):
-    """Of the breathing surface before a moving camera."""
+    """Options of the breathing surface before a moving camera."""
 
     amplitude: float = Field(
         default=0.03,
@@ -111,7 +111,7 @@ class BreathingOptions(DeformingOptions):
 
 
 class BoardOptions(DeformingOptions):
-    """Of the board that is shaken."""
+    """Options of the shaken board."""
 
     shift: float = Field(
         default=0.02, ge=0.0, le=0.2, description="From frame to frame, metres; any direction."

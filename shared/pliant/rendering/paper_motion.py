@@ -21,7 +21,7 @@ _CELL_M = 0.007
 _SWEEPS = 300
 _SHAPES_PER_S = 60.0  # the surface is found this often; in between it goes straight
 _RIM = 0.03  # of the extent: beyond the outermost points the plate would have to guess
-_SMOOTHING = 1e-3  # m^2: leaves 0.2 mm rms, which is how well the points are measured
+_SMOOTHING = 1e-3  # m^2: leaves 0.2 mm rms, the accuracy of the measured points
 
 
 def paper_shape(tracks_m: F64) -> tuple[float, float, Shape]:
@@ -31,7 +31,7 @@ def paper_shape(tracks_m: F64) -> tuple[float, float, Shape]:
     """
     middle = tracks_m[0].mean(axis=0)
     normal = np.linalg.svd(tracks_m[0] - middle, full_matrices=False)[2][2]
-    # Upright as the camera is, and not mirrored.
+    # As upright as the camera, and not mirrored.
     down = np.cross(np.sign(normal[2]) * normal, [1.0, 0.0, 0.0])
     down /= np.linalg.norm(down)
     axes = np.stack([np.cross(down, np.sign(normal[2]) * normal), down])

@@ -24,7 +24,7 @@ _EDGES = np.array(
 
 
 class Tiles(NamedTuple):
-    """For each tile of TILE_PX x TILE_PX pixels the solids that it may show, nearest first."""
+    """The solids that each tile of TILE_PX x TILE_PX pixels may show, nearest first."""
 
     start: I32  # (T + 1,) where a tile's list starts in ``solids``
     solids: I32  # the lists, one after the other

@@ -10,7 +10,7 @@ from pliant.results.run import Run
 
 
 def by_sensors(recording: Recording, run: Run) -> Scale | None:
-    """The surest scale that they give to the longest segment, and the vertical of inertial samples;
+    """The most certain scale of the longest segment, and the vertical by inertial samples;
     None without.   run: without a scale; it notes why samples and fixes were not used.
 
     Raises MessageError.

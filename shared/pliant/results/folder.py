@@ -51,7 +51,7 @@ SURFEL_FILES = (TRAJECTORY_NAME, SURFELS_NAME, REPORT_NAME, PAGE_NAME)
 SCALE_NAME = "scale.yaml"
 MESH_ERROR_NAME = "mesh_error.png"
 SOMETIMES = (MAP_NAME, SCALE_NAME, MESH_ERROR_NAME)
-"""Of a map that came to its end, of one whose scale is known, and of a mesh that was evaluated."""
+"""Files of a completed map, of a map with a known scale, and of an evaluated mesh."""
 MESH_FILES = ("mesh.ply", "mesh_coarse.ply", "mesh.png", "mesh_shaded.png", "mesh_normals.png")
 _SWITCHING = ".results-whole"
 """Results that are whole, and on their way to their places."""
@@ -267,7 +267,7 @@ def settle_killed(output: Path) -> None:
 
 
 def let_go(output: Path) -> None:
-    """Delete the earlier result: the new one has begun, and its recording is put on the disk.
+    """Delete the earlier result, once the recording of the new one is on disk.
 
     Raises ResultError.
     """
@@ -324,7 +324,7 @@ def _result_in(output: Path) -> Iterator[Path]:
 
 
 def _begun_in(output: Path) -> Iterator[Path]:
-    """Those that a run without a frame may have made."""
+    """Files that a run without a frame may have made."""
     folder = parts.folder_of_parts(output / RECORDING_NAME)
     found = parts.parts_in(folder)
     yield from found

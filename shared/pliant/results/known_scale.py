@@ -96,7 +96,7 @@ def level_of(R: F64, sigma_deg: float) -> Level:
 
 
 def read_scale(folder: Path) -> Scale | None:
-    """That of a result folder; None without.  Raises ResultError for a file that is none."""
+    """The scale of a result folder, or None.  Raises ResultError for an invalid file."""
     path = folder / SCALE_NAME
     try:
         content = load_yaml(path.read_text(encoding="utf-8"))

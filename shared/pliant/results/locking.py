@@ -16,7 +16,7 @@ LOCK_NAME = ".lock"
 _LONGEST = 20
 """Bytes of a lock file: the number of a process."""
 _WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOTSUP)
-"""Of a file system that has none."""
+"""Errors of a file system without locks."""
 _OPENED = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 

@@ -188,7 +188,7 @@ def known_keyframes(recording: Recording) -> Iterator[MapKeyframe]:
 
 @dataclass(kw_only=True)
 class SeenKeyframe:
-    """The last image and observations of a keyframe.
+    """The latest image and observations of a keyframe.
 
     jpeg: b"" without a recorded image.   mask: of that image; b"": the whole image is used.
     point_ids: (N,).   points_px: (N, 2).

@@ -134,7 +134,7 @@ def _trajectory(followed: list[tuple[int, F64]]) -> Trajectory:
 
 
 def surfel_summary(report: dict[str, Any]) -> list[str]:
-    """The report in a few lines."""
+    """The summary of the report, in a few lines."""
     alive, frames = report["alive_per_frame"], report["frames"]
     lines = [
         (

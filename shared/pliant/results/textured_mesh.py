@@ -30,7 +30,7 @@ from pliant.results.run import Run
 _EXPOSURE_SAMPLES = 4096
 """Places on the mesh by whose colours keyframes are compared."""
 _LEAST_SHARPNESS = 0.1
-"""Of images without detail: they colour what no other shows.  Sharp ones have 0.45 to 0.75."""
+"""Images without detail, below this, colour only what no other shows.  Sharp: 0.45 to 0.75."""
 
 
 def textured(

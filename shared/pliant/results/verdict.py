@@ -105,7 +105,7 @@ def _scale_lines(report: dict[str, Any]) -> list[str]:
 
 
 def _told_by_gyro(report: dict[str, Any]) -> list[str]:
-    """What the gyro has done for the poses, where that is worth a line."""
+    """Lines about the poses by the gyro, if there are any."""
     counters = report.get("counters", {}).get("bundle_adjustment", {})
     carried, lines = report.get("frames_by_gyro", []), list[str]()
     if carried:

@@ -114,7 +114,7 @@ def _write_files(folder: Path, run: Run, final: dict[int, Any], report: dict[str
 
 
 def _scale_comment(run: Run) -> str:
-    """For people: a camera has no scale, so readers of a calibration take no notice."""
+    """A comment for people: a calibration has no scale, so its readers ignore it."""
     if run.scale is None:
         return ""
     return f"# the map of this result is in metres: scale +- {run.scale.sigma:.2%}\n"

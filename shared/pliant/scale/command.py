@@ -26,7 +26,7 @@ _WITHOUT_LENGTHS = ("images", "overlay", "picture", "overview")
 
 @dataclass(frozen=True, kw_only=True)
 class Known:
-    """A known length in the scene: one of these.
+    """A known length in the scene; exactly one is given.
 
     points: two points of the map, and the metres between them.   marker: side of the markers.
     depth: a source with depth maps.   gps: the satellite fixes of the run's source.

@@ -19,7 +19,7 @@ from pliant.wording import counted
 _DICTIONARIES = ("4X4_250", "5X5_250", "6X6_250", "7X7_250", "ARUCO_ORIGINAL", "APRILTAG_36H11")
 _LEAST_VIEWS = 3
 _MAX_SPREAD = 0.05
-"""Of a square's sides and diagonals, as a share of its side; of the depth of its corners, too."""
+"""Maximum spread of a square's sides, diagonals and corner depths, as a share of its side."""
 
 _Marker = tuple[str, int]
 """Dictionary and number."""

@@ -1,4 +1,4 @@
-"""The whole pipeline: accuracy, speed, losses, kills, memory."""
+"""The whole pipeline: accuracy, speed, losses, memory."""
 
 from pathlib import Path
 from typing import Annotated
@@ -160,21 +160,6 @@ def replay(
     from benchmarks.replay_rate import measure
 
     show(measure(recording, service, runs))
-
-
-@app.command()
-def kills(
-    source: Annotated[str, typer.Argument(help="Of 300 frames.")] = "built-in:room",
-    count: Annotated[int, typer.Option(min=1, help="How often each.")] = 20,
-    seed: Annotated[int, typer.Option(help="Chooses the moments.")] = 0,
-) -> None:
-    """kill -9 of each service, and of all at once, at random moments: are the results the same?
-
-    scripts/bench kills built-in:room --count 20
-    """
-    from benchmarks.whole_runs import kills
-
-    show(kills(source, count, seed))
 
 
 @app.command()

@@ -5,7 +5,7 @@ import numpy as np
 from pliant.algorithms.arrays import U8
 
 _LINES = 1088
-"""Of interlaced video, at most."""
+"""Maximum lines of interlaced video."""
 _COLUMNS = 8
 _COMBED = 1.25
 """How much lines differ from the next over how much from the next but one.  Images of cameras have

@@ -58,7 +58,7 @@ _IN_MOTION = 0.5
 horizon stands still as well, and so does all around it."""
 
 _MOST_OVERLAID = 0.5
-"""Of the image: overlays that cover more than this are none."""
+"""Maximum share of the image that overlays cover."""
 
 _ROUND = 0.01
 _ROUND_SHARE = 0.8
@@ -74,7 +74,7 @@ _MARGIN = 0.01
 """Margin of the mask beyond the detected region, share of the longer side."""
 
 _JOINED = 0.02
-"""Of the longer side: letters that lie so near to each other are masked as one."""
+"""Share of the longer side: letters closer than this are masked together."""
 
 
 @dataclass(frozen=True)

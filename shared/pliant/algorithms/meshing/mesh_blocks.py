@@ -124,7 +124,7 @@ class BlockMesh:
         return len(self._blocks)
 
     def changes(self, blocks: MeshBlocks) -> MeshBlocks:
-        """Those of the blocks that differ from what is held, for a reader that holds the same."""
+        """Return the blocks that differ from the stored ones, for a reader that has the same."""
         starts, faces = _bounds(blocks.vertex_counts), _bounds(blocks.triangle_counts)
         differ = np.zeros(len(blocks.keys), np.bool_)
         for row, key in enumerate(pack(blocks.keys).tolist()):
@@ -221,7 +221,7 @@ def _edge_ids(keys: I32, edges: I32) -> I64:
 
 
 def _parts(count: int) -> Iterator[slice]:
-    """Of many rows, so that what is in between stays small."""
+    """Slices of many rows, so that temporary arrays stay small."""
     return (slice(first, first + _ROWS) for first in range(0, count, _ROWS))
 
 
@@ -267,7 +267,7 @@ def _same(held: MeshBlocks, blocks: MeshBlocks, at: slice, face: slice) -> bool:
 
 
 def joined_blocks(parts: list[MeshBlocks]) -> MeshBlocks:
-    """Those of the first part, then those of the next ones; keys must ascend throughout.
+    """Concatenate the blocks of several parts; keys must ascend throughout.
 
     The list is empty then.
     """

@@ -1,4 +1,4 @@
-"""Everything that a user may change about meshing."""
+"""Parameters of meshing."""
 
 from typing import Literal
 
@@ -8,7 +8,7 @@ from pliant.algorithms.parameters import Parameters
 
 
 class NltgvParameters(Parameters):
-    """What a user may change about smoothing.  Weights have no unit; see the module."""
+    """Parameters of smoothing.  Weights have no unit; see ``nltgv``."""
 
     data_weight: float = Field(
         default=0.5, gt=0.0, description="Weight of the data relative to the smoothness (lambda)."
@@ -66,7 +66,7 @@ class NltgvParameters(Parameters):
 
 
 class TriangleFilterParameters(Parameters):
-    """What a user may change about which triangles are kept."""
+    """Limits of the triangles that are kept."""
 
     max_edge_px: float = Field(
         default=100.0, gt=0.0, description="Maximum edge of a triangle in the image, px."

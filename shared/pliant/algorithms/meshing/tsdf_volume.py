@@ -80,7 +80,7 @@ class TsdfVolume:
 
     @property
     def memory_bytes(self) -> int:
-        """What the voxels take, with the room kept for more."""
+        """Memory of the voxels, with the capacity reserved for more."""
         return self._blocks.room * BLOCK_BYTES
 
     def integrate(

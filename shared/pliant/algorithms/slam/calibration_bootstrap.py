@@ -40,7 +40,7 @@ class _Taken(NamedTuple):
 
     @property
     def stamp_ns(self) -> int:
-        """Of the frame."""
+        """Capture time of the frame."""
         return self.frame.stamp_ns
 
 

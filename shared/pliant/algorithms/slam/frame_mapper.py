@@ -1,4 +1,4 @@
-"""What maps or localises the frames of a source: one interface for the three that do."""
+"""The interface of the three classes that map or localise the frames of a source."""
 
 from collections.abc import Iterable
 from typing import Protocol
@@ -41,8 +41,8 @@ class FrameMapper(Protocol):
         ...
 
     def kept(self) -> Iterable[KeptKeyframe]:
-        """Return the map as it is to be kept, after ``finish``."""
-        ...
+        """Return the map to be saved, after ``finish``; nothing if it is unchanged."""
+        return ()
 
     @property
     def global_adjustment(self) -> GlobalAdjustment:
@@ -52,7 +52,7 @@ class FrameMapper(Protocol):
     @property
     def waiting_frames(self) -> list[int]:
         """Numbers of the frames from which a map may still start."""
-        ...
+        return []
 
     @property
     def point_count(self) -> int:
@@ -62,4 +62,4 @@ class FrameMapper(Protocol):
     @property
     def counters(self) -> dict[str, int]:
         """Counts for the summary of a run."""
-        ...
+        return {}

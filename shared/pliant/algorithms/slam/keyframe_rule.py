@@ -19,7 +19,7 @@ from pliant.algorithms.slam.parameters import KeyframeParameters
 
 
 class Overlap(NamedTuple):
-    """What a frame shares with the last keyframe.
+    """The overlap of a frame with the last keyframe.
 
     share: of the keyframe's landmarks that are tracked.   in_view: share that is in the image.
     flow: median motion of the landmarks without the rotation, px at 640x480.

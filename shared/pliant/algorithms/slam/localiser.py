@@ -27,6 +27,7 @@ from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment
 from pliant.algorithms.slam.atlas.known_places import KnownPlaces
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.frame import Frame, IdealFrame, PlacedFrame
+from pliant.algorithms.slam.frame_mapper import FrameMapper
 from pliant.algorithms.slam.journal import Journal, Outcome
 from pliant.algorithms.slam.locate.landmark_search import LandmarkSearch
 from pliant.algorithms.slam.locate.localisation import Motion
@@ -44,7 +45,7 @@ _LOOK_SHIFT = 0.05
 """Share of the depth: after a larger motion or rotation, other keyframes may be covisible."""
 
 
-class Localiser:
+class Localiser(FrameMapper):
     """A ``FrameMapper`` that never extends its map.
 
     A pure function of camera, map, parameters, seed and the frames in their order.
@@ -62,7 +63,7 @@ class Localiser:
         given = SelfCalibration.of(camera, parameters.calibration)
         found = known_camera(known, camera) or given
         self.calibration = replace(found, uncertainty=given.uncertainty)
-        self.global_adjustment = GlobalAdjustment()
+        self._no_adjustment = GlobalAdjustment()
         self._generator = np.random.default_rng(seed)
         self._points = Landmarks()
         self._journal = Journal(self._points)
@@ -127,23 +128,14 @@ class Localiser:
         return self._publish(WAITING if self._map is None else TRACKING, reason, 0)
 
     @property
-    def waiting_frames(self) -> list[int]:
-        """None, because no map will start."""
-        return []
+    def global_adjustment(self) -> GlobalAdjustment:
+        """One without a job, because the map is unchanged."""
+        return self._no_adjustment
 
     @property
     def point_count(self) -> int:
         """Number of landmarks in the map."""
         return int(np.count_nonzero(self._points.state == MAPPED))
-
-    @property
-    def counters(self) -> dict[str, int]:
-        """None, because the map is unchanged."""
-        return {}
-
-    def kept(self) -> list[KeptKeyframe]:
-        """Nothing, because the map is unchanged."""
-        return []
 
     def finish(self, timer: StageTimer = no_stages) -> MapDelta:
         """As ``Mapper.finish``."""

@@ -105,42 +105,13 @@ class Mapper:
         self._published_frames = 0
         self._focals_published = False
 
-    @property
-    def calibration(self) -> SelfCalibration:
-        """The current calibration."""
-        return self.atlas.calibration
-
-    @property
-    def _camera(self) -> PinholeCamera:
-        """The ideal camera in whose pixels the mapper works."""
-        return self.calibration.view.camera
-
-    @property
-    def global_adjustment(self) -> GlobalAdjustment:
-        """Global bundle adjustment of the active segment."""
-        return self.atlas.global_adjustment
-
-    @property
-    def point_count(self) -> int:
-        """Number of landmarks in all segments."""
-        return self.atlas.point_count
-
-    @property
-    def counters(self) -> dict[str, int]:
-        """Results of place comparisons, and numbers of dropped keyframes and landmarks."""
-        atlas = self.atlas
-        return atlas.places.comparisons.counters | atlas.dropped | self._turns.counters
-
-    def kept(self) -> Iterator[KeptKeyframe]:
-        """Yield the keyframes of the map to be saved."""
-        return self.atlas.kept()
-
     def process(self, frame: Frame, timer: StageTimer = no_stages) -> MapDelta:
         """Localise a frame, extend the map, and return what readers need."""
         return self.publish(self.take(frame, timer))
 
     def take(self, frame: Frame, timer: StageTimer = no_stages) -> Outcome:
         """Localise a frame and extend the map."""
+        self._stamps_ns[frame.number] = frame.stamp_ns
         ideal = self._catch_up(frame, timer)
         located = self._locate(ideal, timer)
         active = self.atlas.active
@@ -159,19 +130,21 @@ class Mapper:
 
     def _catch_up(self, frame: Frame, timer: StageTimer) -> IdealFrame:
         """Apply finished corrections of map and calibration, and correct the frame by them."""
-        atlas = self.atlas
-        self._stamps_ns[frame.number] = frame.stamp_ns
-        if atlas.active is not None:
+        if self.atlas.active is not None:
             with timer("whole map"):
                 before = self.calibration
-                self.follow(atlas.catch_up(frame.number))
+                self.follow(self.atlas.catch_up(frame.number))
                 if not self.calibration.sees_like(before):
                     self._waiting = self._waiting.seen_by(before.view, self.calibration.view)
-            atlas.active.links.follow(frame.extrema.ids, atlas.points)
-            atlas.focus(self._motion, frame.stamp_ns, frame.extrema)
-            self._motion = self._turns.predict(self._motion, frame.stamp_ns)
+            self._predict(self.atlas.active, frame)
         with timer("corrected view"):
             return IdealFrame.of(frame, self.calibration)
+
+    def _predict(self, active: ActiveMap, frame: Frame) -> None:
+        """Continue the tracks and the focal length, and predict the rotation by the gyro."""
+        active.links.follow(frame.extrema.ids, active.points)
+        self.atlas.focus(self._motion, frame.stamp_ns, frame.extrema)
+        self._motion = self._turns.predict(self._motion, frame.stamp_ns)
 
     def _reacquire(
         self, active: ActiveMap, frame: IdealFrame, located: F64, timer: StageTimer
@@ -290,9 +263,7 @@ class Mapper:
         self._stamps_ns[frame.number] = frame.stamp_ns
         self._keyframe_is_new = False
         if active is not None and not self._lost_frames:
-            active.links.follow(frame.extrema.ids, active.points)
-            self.atlas.focus(self._motion, frame.stamp_ns, frame.extrema)
-            self._motion = self._turns.predict(self._motion, frame.stamp_ns)
+            self._predict(active, frame)
             found = pose_by_tracks(active, self.calibration, self._motion, frame, self._generator)
         if active is None or found is None:
             ideal = IdealFrame.of(frame, self.calibration)
@@ -482,3 +453,33 @@ class Mapper:
                 log_focals=np.array([keyframe.log_focal for keyframe in made]),
             )
         return delta
+
+    @property
+    def calibration(self) -> SelfCalibration:
+        """The current calibration."""
+        return self.atlas.calibration
+
+    @property
+    def _camera(self) -> PinholeCamera:
+        """The ideal camera in whose pixels the mapper works."""
+        return self.calibration.view.camera
+
+    @property
+    def global_adjustment(self) -> GlobalAdjustment:
+        """Global bundle adjustment of the active segment."""
+        return self.atlas.global_adjustment
+
+    @property
+    def point_count(self) -> int:
+        """Number of landmarks in all segments."""
+        return self.atlas.point_count
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Results of place comparisons, and numbers of dropped keyframes and landmarks."""
+        atlas = self.atlas
+        return atlas.places.comparisons.counters | atlas.dropped | self._turns.counters
+
+    def kept(self) -> Iterator[KeptKeyframe]:
+        """Yield the keyframes of the map to be saved."""
+        return self.atlas.kept()

@@ -39,7 +39,7 @@ class LastSharp:
     tracks: Tracks
 
     def lost(self, table: TrackTable) -> Tracks:
-        """Its tracks that are lost now."""
+        """Return the tracks of that frame that are lost now."""
         gone = ~np.isin(self.tracks["id"], table.tracks["id"], assume_unique=True)
         return self.tracks[gone]
 

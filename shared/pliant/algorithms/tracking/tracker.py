@@ -32,7 +32,7 @@ from pliant.algorithms.tracking.upkeep import BirthLimits, compact, start_tracks
 from pliant.algorithms.tracks import FrameExtrema
 
 MAX_BRIEF_DISTANCE_BITS = 64
-"""Of 256: beyond this a pair is as likely chance as not."""
+"""Maximum distance of 256 bits: beyond, a pair is as likely wrong as right."""
 
 _KAPPA_BITS = 8
 """Significant bits of a published kappa: of a cube of the contrast, sign and size matter."""

@@ -71,7 +71,7 @@ def _origin_of(dataset: Dataset) -> Dataset:
 def _on_clock(found: Measurements, stamps_ns: I64, dataset: Dataset) -> Measurements:
     """Samples of one sensor on the clock of the images.
 
-    Of another clock, the first sample is at the first image.
+    With a clock of their own, the first sample is at the first image.
     """
     image = next(iter(_origin_of(dataset)), None) if len(stamps_ns) else None
     if image is None:

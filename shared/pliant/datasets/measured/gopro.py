@@ -10,7 +10,7 @@ from pliant.errors import DatasetError
 
 _KIND = b"gpmd"
 _MOST_BYTES = 1 << 22
-"""Of a payload, which lasts a second: 300 times as much as cameras write."""
+"""Maximum size of a payload, which lasts a second: 300 times as much as cameras write."""
 
 
 def read_gopro(file: Path) -> Measurements:

@@ -29,10 +29,10 @@ _TYPES = {**_INTEGERS, "J": ">u8", "f": ">f4", "d": ">f8", "q": ">i4", "Q": ">i8
 """Types of numbers as numpy names them."""
 _FIXED_POINT = {"q": 2.0**-16, "Q": 2.0**-32}
 _DEFAULT_ORDER = "ZXY"
-"""Of cameras whose stream lacks it: HERO5 and later."""
+"""Order of axes of cameras whose stream lacks it: HERO5 and later."""
 _FIX_3D = 3
 _LEAST_PAYLOADS = 4
-"""For a straight line through their times."""
+"""Minimum payloads for a straight line through their times."""
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ def sensors_of(file: MessageFile, spec: SourceSpec) -> Measurements:
 def sensor_topics(
     opened: OpenMessages, spec: SourceSpec, file: MessageFile
 ) -> tuple[list[MessageTopic], list[MessageTopic]]:
-    """Those of inertial samples and of satellite fixes.  Raises as ``sensors_of``."""
+    """Topics of inertial samples, and of satellite fixes.  Raises as ``sensors_of``."""
     return (
         _chosen(opened, IMU_TYPES, spec.imu, file, "inertial samples", "--imu"),
         _chosen(opened, FIX_TYPES, spec.gps, file, "satellite fixes", "--gps"),
@@ -88,7 +88,7 @@ def _chosen(
 
 
 def _imu(opened: OpenMessages, topics: Sequence[MessageTopic], file: MessageFile) -> Measurements:
-    """Of the topic of both sensors, or of the gyro's and the accelerometer's."""
+    """Samples of one topic with both sensors, or of the gyro's and the accelerometer's."""
     where = f"{file.path.name}: {' and '.join(topic.name for topic in topics)}"
     gyro, unreadable = _read(opened, topics[0], _gyro_and_accel, 6)
     accel, more = (gyro, 0) if len(topics) == 1 else _read(opened, topics[1], _gyro_and_accel, 6)

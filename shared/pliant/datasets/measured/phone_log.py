@@ -73,7 +73,7 @@ def _at(measured: Series, gravity: Series) -> F64:
 
 
 def _table(folder: Path, pattern: str) -> Path | None:
-    """The first file of a name, without regard to capitals and spaces."""
+    """The first file with a name, ignoring case and spaces."""
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() == ".csv" and path.is_file():
             name = re.sub(r"[\s-]", "", path.stem.lower())

@@ -64,7 +64,7 @@ def ended(report: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def table_rows(told: Iterable[tuple[str, str]]) -> str:
-    """Of a <table>: what, and how much of it."""
+    """Rows of a <table>: names and values."""
     return "".join(f"<tr><th>{escape(a)}</th><td>{escape(b)}</td></tr>" for a, b in told)
 
 

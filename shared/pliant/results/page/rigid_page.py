@@ -28,13 +28,13 @@ from pliant.results.textured_mesh import textured
 from pliant.wording import counted
 
 _TRIANGLES, _TEXELS, _VIEWS = 40_000, 1024, 48
-"""Of the mesh, of a side of its texture, and keyframes that colour it: a page has a megabyte."""
+"""Limits of the mesh, of a side of its texture, and of its keyframes: a page has a megabyte."""
 _PICTURES = 24
 _WIDTH_PX = 480
 _FPS = 4.0
 _DOT, _DOTS = 1.2, 3000
 _SOME_READOUT = 0.05
-"""Of the frame interval: less is none, as well as images tell."""
+"""Share of the frame interval: a shorter readout is not distinguishable from none."""
 
 
 def write_page(

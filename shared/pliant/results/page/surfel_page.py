@@ -22,7 +22,7 @@ def write_surfel_page(
 ) -> None:  # fmt: skip
     """Write report.html of a run of the deformable profile.
 
-    lines: the report in a few.   surface: as it was in the end; None without any.
+    lines: the summary.   surface: of the last frame; None without one.
     names: of the other files beside it.
     """
     fill_page(

@@ -203,7 +203,7 @@ class ActiveMap:
         return candidates if self.candidates_agree else candidates[:0]
 
     def overlap(self, age_s: float, interval_s: float) -> Overlap:
-        """Of the frame in the window with the last keyframe.  age_s, interval_s: as of it."""
+        """Overlap of the current frame with the last keyframe.   age_s, interval_s: of it."""
         shared, before, flow_px = self.window.flow_since_keyframe(MAPPED)
         if shared < self.parameters.start.min_points and len(self.helping_candidates()):
             shared, before, flow_px = self.window.flow_since_keyframe(CANDIDATE)

@@ -71,7 +71,7 @@ class CorrectedView:
 
     @property
     def move(self) -> Move | None:
-        """What ``image`` does to an image, as of ``MovedImage``."""
+        """The move that ``image`` applies, as of ``MovedImage``."""
         return self._places if self._correction.any() or self._log_focal else None
 
     @property

@@ -24,7 +24,7 @@ _HELD = 1e-5
 def turn_of_lens(
     points_a: F64, points_b: F64, *, scale: float, focal_sigma: float, lens_sigma: float
 ) -> F64:
-    """What no turn explains, whatever the lens is: (..., N) residuals as of ``rotation_between``.
+    """(..., N) residuals, as of ``rotation_between``, that no rotation explains with any lens.
 
     Gauss-Newton with Geman-McClure weights over the rotation, the log focal length s and two
     coefficients of distortion, from several s and the turn that explains most with each.  A point u

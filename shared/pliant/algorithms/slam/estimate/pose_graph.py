@@ -176,7 +176,7 @@ def _parts(S: F64) -> tuple[F64, F64]:
 
 
 def _inverse(S: F64) -> F64:
-    """Of similarities (N, 4, 4)."""
+    """Invert similarities (N, 4, 4)."""
     R, scale = _parts(S)
     out = np.zeros_like(S)
     out[:, :3, :3] = np.swapaxes(R, 1, 2) / scale[:, None, None]

@@ -214,7 +214,7 @@ class BundleResult:
     log_focal: F64 = field(default_factory=lambda: np.zeros(0))
 
     def residual_variance(self, problem: "BundleProblem") -> float:
-        """Of the residuals of the problem that was solved, px^2; 0 where nothing is redundant."""
+        """Variance of the residuals of the solved problem, px^2; 0 without redundancy."""
         unknowns = 3 * len(self.points_world) + 6 * len(self.T_world_camera)
         redundancy = 2 * len(problem.points_px) - unknowns
         return 2.0 * self.final_cost / redundancy if redundancy > 0 else 0.0

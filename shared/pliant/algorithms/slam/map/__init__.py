@@ -1,1 +1,1 @@
-"""What a map consists of: landmarks, keyframes, links."""
+"""The parts of a map: landmarks, keyframes, links."""

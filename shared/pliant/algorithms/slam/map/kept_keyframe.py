@@ -10,7 +10,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.slam.estimate.problem import SHARED
 
 MAP_VERSION = 3
-"""Of what its fields mean, and of how the file has them; a map of a newer version is refused.
+"""Version of the meaning and the encoding of the fields; newer maps are refused.
 2: arrays are in planes, see ``pliant.messages.planes``.   3: corrections have an aspect ratio."""
 
 
@@ -57,7 +57,7 @@ class KeptKeyframe:
     point_patches: Annotated[U8, Shape("P", "S", "S")]
 
     def __post_init__(self) -> None:
-        """Those of a version before 3 end before the aspect ratio, which was right."""
+        """Add the aspect ratio, which was correct, to corrections of versions before 3."""
         for name in ("correction", "sigmas"):
             known = getattr(self, name)
             if known.shape == (SHARED - 1,):

@@ -22,7 +22,7 @@ from pliant.algorithms.slam.places.similarity import Pairs, refine_similarity, s
 
 @dataclass(frozen=True, kw_only=True)
 class PlaceMatch:
-    """What two keyframes have in common.
+    """The common landmarks of two keyframes.
 
     S_old_new: (4, 4) similarity, ``X_old = S_old_new X_new``, between the worlds of their segments;
     in one segment: the drift of the newer one.

@@ -33,7 +33,7 @@ _F = TypeVar("_F", bound=Stamped)
 
 @dataclass(frozen=True, kw_only=True)
 class BufferedFrame:
-    """What is stored of a frame until the map starts."""
+    """The stored part of a frame until the map starts."""
 
     frame: int
     stamp_ns: int
