@@ -1,4 +1,4 @@
-"""Dark for half a second where the camera turns the fastest: with a gyro and without."""
+"""Poses with a gyro and without: of all frames, and dark for half a second in the fastest turn."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -87,18 +87,33 @@ def run(dataset: Dataset, covered: range, seed: int, given: ImuSamples | None) -
     )
 
 
-def measure(
-    motions: Path | None, names: Sequence[str], frames: int, seeds: int, *, is_dark: bool
-) -> Iterator[str]:
-    """A row for each source, sensor and seed.   is_dark: else all is seen, for comparison."""
+def compare(motions: Path | None, names: Sequence[str], frames: int, seeds: int) -> Iterator[str]:
+    """A row for each source: errors of all seeds without a gyro, and with that of a phone."""
+    yield markdown_header(("motion", "without", "with", "change", "spread of seeds without"))
+    changes: list[float] = []
+    for name in names:
+        dataset = source_of(name, motions, frames)
+        truth = read_trajectory(Path(str(dataset.ground_truth_path)))
+        errors = np.zeros((2, seeds))
+        for seed in range(seeds):
+            for row, given in enumerate((None, samples(truth, "phone", seed))):
+                errors[row, seed] = run(dataset, range(0), seed, given).ate_m
+        without, with_gyro = errors.mean(axis=1).tolist()
+        changes.append(with_gyro / without)
+        spread = (errors[0].max() - errors[0].min()) / without
+        told = f"{changes[-1] - 1.0:+.1%}", f"{spread:.1%}"
+        yield markdown_row([name, metres(without), metres(with_gyro), *told])
+    yield f"geometric mean of the changes {np.exp(np.mean(np.log(changes))) - 1.0:+.1%}"
+
+
+def measure(motions: Path | None, names: Sequence[str], frames: int, seeds: int) -> Iterator[str]:
+    """A row for each source, sensor and seed, where half a second is dark."""
     header = ("motion", "turn", "sensor", "seed", "posed", "segments", "ATE", "dark frames, worst")
     yield markdown_header(header)
     for name in names:
         dataset = source_of(name, motions, frames)
         truth = read_trajectory(Path(str(dataset.ground_truth_path)))
-        covered, turn = range(0), 0.0
-        if is_dark:
-            covered, turn = fastest_turn(truth, dataset.frame_count or len(truth))
+        covered, turn = fastest_turn(truth, dataset.frame_count or len(truth))
         for seed in range(seeds):
             for sensor in ("none", *SENSORS):
                 given = None if sensor == "none" else samples(truth, sensor, seed)

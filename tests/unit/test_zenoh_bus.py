@@ -1,10 +1,13 @@
 """Flow control over real Zenoh sessions: nothing lost, memory bounded, nobody waits for ever."""
 
 import threading
+from pathlib import Path
 
+import numpy as np
 import pytest
 from zenoh_buses import PATIENCE_S, WINDOW, die, image, in_thread, reader, writer
 
+from pliant.algorithms.inertial.preintegration import GyroSignal
 from pliant.bus import health
 from pliant.bus.base import Window
 from pliant.bus.checkpoints import Checkpoints
@@ -174,6 +177,28 @@ def test_messages_kept_for_checkpoints_are_bounded_and_no_service_waits_for_ever
     assert result == [None]
     assert len(kept) == frames
     assert max(kept) <= most
+
+
+def test_a_state_comes_back_with_the_samples_that_it_names(endpoint: str, tmp_path: Path) -> None:
+    """They are beside the checkpoint, not in it."""
+    gyro = np.random.default_rng(0).normal(size=(10_000, 3))
+    signal = GyroSignal(times_s=np.arange(10_000.0), gyro=gyro)
+
+    def opened() -> ZenohBus:
+        return ZenohBus(
+            endpoints=[endpoint], session="test", service="ingest", inputs={}, outputs={},
+            window=WINDOW, checkpoints=Checkpoints(tmp_path, interval=1),
+        )  # fmt: skip
+
+    with opened() as bus:
+        assert bus.restore() is None
+        bus.checkpoint(0, (0, signal))
+    (state,) = tmp_path.glob("*.state")
+    assert state.stat().st_size < 0.01 * gyro.nbytes
+    with opened() as bus:
+        frame, again = bus.restore() or (-1, None)
+    assert frame == 0
+    np.testing.assert_array_equal(again.gyro, gyro)
 
 
 def test_a_reader_that_dies_is_named(endpoint: str) -> None:

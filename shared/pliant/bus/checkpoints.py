@@ -12,6 +12,7 @@ import hashlib
 import io
 import os
 import threading
+import weakref
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -51,7 +52,7 @@ class Checkpoints:
         self._lock = threading.Lock()
         self._writer: threading.Thread | None = None
         self._failure: OSError | None = None
-        self._constants: dict[str, Any] = {}
+        self._constants: dict[str, weakref.ref[Any]] = {}  # as long as the service needs them
         try:
             make_folder(folder)
             for unfinished in folder.glob("*.part"):
@@ -124,7 +125,7 @@ class Checkpoints:
     def keep(self, record: Any) -> str:
         """Store a record that never changes, the first time; returns its name.  Raises BusError."""
         for name, known in self._constants.items():
-            if known is record:
+            if known() is record:
                 return name
         data = save_state(record)
         name = hashlib.sha256(data).hexdigest()
@@ -132,20 +133,20 @@ class Checkpoints:
             _write_whole(self._constant(name), (data,))
         except OSError as error:
             raise BusError(f"{self._folder}: cannot write checkpoints: {error}") from None
-        self._constants[name] = record
+        self._constants[name] = weakref.ref(record)
         return name
 
     def kept(self, name: str) -> Any:
         """The record that a checkpoint names.  Raises BusError and StateError."""
         if not name.isalnum():
             raise StateError(f"{self._folder}: not a name of a record: {name!r}")
-        if name not in self._constants:
-            path = self._constant(name)
-            try:
-                self._constants[name] = load_state(path.read_bytes())
-            except OSError as error:
-                raise BusError(f"{path}: cannot read the checkpoint: {error.strerror}") from None
-        return self._constants[name]
+        path = self._constant(name)
+        try:
+            record = load_state(path.read_bytes())
+        except OSError as error:
+            raise BusError(f"{path}: cannot read the checkpoint: {error.strerror}") from None
+        self._constants[name] = weakref.ref(record)
+        return record
 
     def close(self) -> None:
         """Wait for the one that is being written."""

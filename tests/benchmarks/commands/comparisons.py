@@ -152,10 +152,12 @@ def inertial(
     scripts/bench inertial euroc_gt_leftcam --run tabletop --run V102
     scripts/bench inertial --run room --gyro dark
     """
-    from benchmarks.dark_turns import measure as with_gyro
+    from benchmarks.dark_turns import compare
+    from benchmarks.dark_turns import measure as in_the_dark
     from benchmarks.inertial import measure
 
     if gyro is not None:
-        show(with_gyro(motions, runs or [], frames, seeds, is_dark=gyro == "dark"))
+        with_gyro = in_the_dark if gyro == "dark" else compare
+        show(with_gyro(motions, runs or [], frames, seeds))
         return
     show(measure(motions, only=only or [], runs=runs or [], frames=frames, seeds=seeds))
