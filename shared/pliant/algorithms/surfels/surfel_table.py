@@ -50,7 +50,8 @@ class SurfelTable:
     poses: F64 = field(default_factory=lambda: np.zeros((0, POSE_FLOATS)))  # last good ones
     rest: F64 = field(default_factory=lambda: np.zeros((0, 3)))  # X^0 of Eq. 20, world
     sigmas: F64 = field(default_factory=lambda: np.zeros(0))  # root of its Sigma, metres
-    brightness: F64 = field(default_factory=lambda: np.zeros(0))  # at birth, see ``brightness``
+    # At birth, at the exposure of the first frame: see ``brightness``.
+    brightness: F64 = field(default_factory=lambda: np.zeros(0))
     ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
     state: U8 = field(default_factory=lambda: np.zeros(0, np.uint8))
     born: I32 = field(default_factory=lambda: np.zeros(0, np.int32))
@@ -64,9 +65,13 @@ class SurfelTable:
         return len(self.ids)
 
     def add(
-        self, births: Births, T_world_camera: F64, first_id: int, frame: int, sigmas: F64
-    ) -> None:
-        """Append new surfels, with ids from ``first_id`` on."""
+        self, births: Births, T_world_camera: F64, first_id: int, frame: int, sigmas: F64,
+        exposure: float = 1.0,
+    ) -> None:  # fmt: skip
+        """Append new surfels, with ids from ``first_id`` on.
+
+        exposure: of their frame, relative to the first.
+        """
         n = len(births.poses)
         poses = move_poses(births.poses, T_world_camera)
         validations = new_validations(n)
@@ -83,7 +88,7 @@ class SurfelTable:
         self.tried = np.concatenate([self.tried, poses[:, X : X + 3]])
         self.rest = np.concatenate([self.rest, poses[:, X : X + 3]])
         self.sigmas = np.concatenate([self.sigmas, sigmas])
-        self.brightness = np.concatenate([self.brightness, brightness(births.poses)])
+        self.brightness = np.concatenate([self.brightness, exposure * brightness(births.poses)])
         self.ids = np.concatenate([self.ids, np.arange(first_id, first_id + n)])
         self.state = np.concatenate([self.state, np.zeros(n, np.uint8)])
         self.born = np.concatenate([self.born, np.full(n, frame, np.int32)])

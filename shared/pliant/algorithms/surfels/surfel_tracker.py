@@ -9,6 +9,7 @@ from pliant.algorithms.slam.places.place_index import Features, describe
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.surfels import validation
 from pliant.algorithms.surfels.births import find_births
+from pliant.algorithms.surfels.brightness import exposure
 from pliant.algorithms.surfels.camera_alignment import align_rigid, fit_camera, spread
 from pliant.algorithms.surfels.deformation_models import MODELS, move_poses
 from pliant.algorithms.surfels.depth_maps import depth_between
@@ -391,13 +392,23 @@ class SurfelTracker:
             table.keep(np.sort(newest))
         # The heuristic covariance of section V: a share of the surfel's depth, all directions.
         sigmas = np.maximum(p.expected_motion * births.poses[:, X + 2], 1e-9)
-        table.add(births, self._T_world_camera, self._next_id, self._frame, sigmas)
+        table.add(
+            births, self._T_world_camera, self._next_id, self._frame, sigmas, self._exposure()
+        )
         table.connect(len(table) - n, p.neighbours, with_earlier=not flat)
         self._next_id += n
         self._lost = int(table.tracked.sum()) < p.min_alive
         rows = (table.born == self._frame).astype(np.uint8)
         poses = move_poses(table.poses, inverse(self._T_world_camera))
         validation.validate_all(poses, rows, self._matcher(0, pyramid[0]), table.validations)
+
+    def _exposure(self) -> float:
+        """Of the last frame relative to the first of this segment, where brightness counts."""
+        table = self._table
+        if self._parameters.light != "camera" or not table.tracked.any():
+            return 1.0
+        poses = move_poses(table.poses, inverse(self._T_world_camera))
+        return exposure(poses, table.brightness, table.templates[0].means, table.tracked)
 
     def _update_templates(self, pyramid: list[Level]) -> None:
         if self._lost or not len(self._table):
