@@ -51,7 +51,7 @@ def test_surfels_without_neighbours_have_the_zncc_of_birth() -> None:
     assert confidence(table) == pytest.approx(np.clip(table.birth_zncc, 0.0, 1.0))
 
 
-def test_old_positions_of_lost_surfels_count_for_nobody() -> None:
+def test_old_positions_of_lost_surfels_do_not_count() -> None:
     table = tracked_table(8)
     before = confidence(table)
     lost = np.arange(len(table)) % 3 == 0
