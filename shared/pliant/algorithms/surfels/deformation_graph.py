@@ -198,7 +198,8 @@ def median_strains(poses: F64, edges: Edges, known: BoolArray) -> F64:
     this share of their distance.  NaN without edges between known ones.
     """
     out = np.full(len(poses), np.nan)
-    used = Edges(*(column[known[edges.ends].all(axis=1)] for column in edges))
+    rows = known[edges.ends].all(axis=1)
+    used = Edges(edges.ends[rows], edges.first[rows], edges.second[rows], edges.lengths[rows])
     if len(used.ends):
         _median_strains(used, edge_rows(poses, used)[1], out)
     return out
