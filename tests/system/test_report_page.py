@@ -4,7 +4,6 @@ import base64
 import json
 import re
 import shutil
-import subprocess
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from browser import in_browser
 from running import TINY, undescribed
 from running import pliant as pliant_command
 
@@ -100,25 +100,6 @@ def test_the_mesh_has_a_texture_of_its_keyframes(result: pliant.Result, page: st
     away = np.linalg.norm(places[:, None] - result.mesh.positions[None, ::10], axis=2)
     own = result.mesh.colours[::10][away.argmin(axis=1)].astype(np.float64)
     assert np.median(np.abs(texture[rows, columns][::50] - own)) < 15.0
-
-
-def in_browser(
-    page: Path, profile: Path, what: str, size: str = "1000,900"
-) -> subprocess.CompletedProcess[str]:
-    browser = shutil.which("chromium") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("chromium is not installed")
-    return subprocess.run(
-        [
-            *(browser, "--headless", "--no-sandbox", f"--window-size={size}"),
-            *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
-            *(f"--user-data-dir={profile / 'browser'}", "--virtual-time-budget=20000"),
-            *(what, page.as_uri()),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
 
 
 def test_a_browser_draws_it(result: pliant.Result, tmp_path: Path) -> None:

@@ -67,6 +67,17 @@ def test_another_scene_starts_another_segment() -> None:
     assert frames[-1].segment == 1
 
 
+def test_a_single_strange_frame_starts_nothing() -> None:
+    """Though it has texture, and the last births were long ago."""
+    same = view(0, bare=False)
+    strange = np.random.default_rng(0).integers(0, 245, same.shape).astype(np.uint8)
+    _, frames = follow([same, same, same, strange, same], "flat", 80)
+    assert [frame.lost for frame in frames] == [False, False, False, True, False]
+    assert {frame.segment for frame in frames} == {0}
+    _, frames = follow([same, same, same, *[strange] * 4], "flat", 80)
+    assert [frame.segment for frame in frames] == [0, 0, 0, 0, 0, 1, 1]
+
+
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
 def test_the_depth_between_surfels_is_theirs(tilt: float) -> None:
     points = np.random.default_rng(0).uniform((0, 0), (320, 240), (200, 2))

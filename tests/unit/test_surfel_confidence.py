@@ -6,6 +6,7 @@ from surfel_scene import STEP_S, board_renderer, film, motion
 
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.patch_sampling import X
+from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.algorithms.surfels.surfel_table import SurfelTable, frame_of
 from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
 
@@ -22,8 +23,11 @@ def tracked_table(neighbours: int) -> SurfelTable:
     return tracker._table
 
 
-def confidence(table: SurfelTable) -> np.ndarray:
-    frame = frame_of(table, frame=1, segment=0, lost=False, T_world_camera=np.eye(4))
+def confidence(table: SurfelTable, number: int = 1, *, depth_is_known: bool = True) -> np.ndarray:
+    frame = frame_of(
+        table, frame=number, segment=0, lost=False, T_world_camera=np.eye(4),
+        depth_is_known=depth_is_known,
+    )  # fmt: skip
     assert frame.confidence.shape == frame.ids.shape
     return frame.confidence
 
@@ -45,3 +49,25 @@ def test_surfels_without_neighbours_have_the_zncc_of_birth() -> None:
     table.birth_zncc[:3] = -0.5, 0.4, 1.0
     np.testing.assert_allclose(confidence(table)[:3], [0.0, 0.4, 1.0])
     assert confidence(table) == pytest.approx(np.clip(table.birth_zncc, 0.0, 1.0))
+
+
+def test_old_positions_of_lost_surfels_do_not_count() -> None:
+    table = tracked_table(8)
+    before = confidence(table)
+    lost = np.arange(len(table)) % 3 == 0
+    table.state[lost] = SurfelState.OUTLIER
+    table.poses[lost, X : X + 3] *= 1.1
+    table.birth_zncc[lost] = 0.6
+    after = confidence(table)
+    alone = np.isin(np.arange(len(table)), table.edges.ends[~lost[table.edges.ends].any(axis=1)])
+    assert alone[~lost].mean() > 0.9
+    np.testing.assert_allclose(after[alone], before[alone], atol=0.05)
+    np.testing.assert_allclose(after[lost], 0.3)
+
+
+def test_made_up_depth_must_be_tried() -> None:
+    table = tracked_table(8)
+    known = confidence(table)
+    for age, share in ((0, 1 / 2), (1, 2 / 3), (98, 99 / 100)):
+        tried = confidence(table, age, depth_is_known=False)
+        np.testing.assert_allclose(tried, share * known, rtol=1e-5)

@@ -88,12 +88,18 @@ def test_the_median_strain_is_that_of_plain_numpy() -> None:
     poses[:, X : X + 3] += np.random.default_rng(2).normal(0.0, 0.01, (N, 3))
     residuals = edge_rows(poses, edges)[1][:, 0]
     strains = np.linalg.norm(residuals, axis=1) / edges.lengths
-    expected = [np.median(strains[(edges.ends == row).any(axis=1)]) for row in range(N)]
-    np.testing.assert_allclose(median_strains(poses, edges), expected)
+    known = np.ones(N, np.bool_)
+    known[3] = False
+    compared = (edges.ends != 3).all(axis=1)
+    expected = [
+        np.median(strains[(edges.ends == row).any(axis=1) & compared]) if known[row] else np.nan
+        for row in range(N)
+    ]
+    np.testing.assert_allclose(median_strains(poses, edges, known), expected)
     # A surfel that is added has no edges yet.
-    more = np.concatenate([poses, poses[:1]])
-    assert np.isnan(median_strains(more, edges)).tolist() == [False] * N + [True]
-    assert np.isnan(median_strains(poses, no_edges())).all()
+    more, known = np.concatenate([poses, poses[:1]]), np.ones(N + 1, np.bool_)
+    assert np.isnan(median_strains(more, edges, known)).tolist() == [False] * N + [True]
+    assert np.isnan(median_strains(poses, no_edges(), known[:N])).all()
 
 
 def test_a_rigid_motion_costs_nothing() -> None:

@@ -11,9 +11,11 @@ the surfel, marked 0, a patch of mean grey level I tells
     b = b_0 (I / I_0) / e,    e = c / c_0,
 
 one equation for position and normal.  A stretched surface looks like one that has come closer, but
-is not brighter.  e is the same for all surfels of a frame: 1 if the exposure is fixed, otherwise
-the median of what they tell at their present poses.  Mean grey levels count, since blur changes
-the contrast of a patch.
+is not brighter.  e is the same for all surfels that were born in one frame: 1 if the exposure is
+fixed, otherwise the median of what they tell at their present poses.  So a surfel that is born
+later keeps e b_0 instead of b_0, with the e of its frame of birth: it is then compared with the
+exposure of the first frame, as the others are, and one e remains for all.  Mean grey levels count,
+since blur changes the contrast of a patch.
 
 Of a surface that may stretch, size and shading together tell more than each alone.  So with this
 light surfels have the general model of Table I with a soft isometry, and the residual
@@ -80,13 +82,23 @@ def measured_brightness(
 ) -> F64:
     """(N,) b of the surfels by the mean grey levels of their patches, 1 / m^2.
 
-    births: (N,) b at birth.  means: (N,) of the templates, whose grey levels are those of birth.
-    residuals: (N,) mean of gain (I - mean) + bias - template.  rows: (N,) which surfels tell the
-    exposure; none if it is fixed.
+    births: (N,) b at birth, at the exposure of the first frame.  means: (N,) of the templates,
+    whose grey levels are those of birth.  residuals: (N,) mean of gain (I - mean) + bias -
+    template.  rows: (N,) which surfels tell the exposure; none if it is fixed.
     """
     now = means + (residuals - poses[:, BIAS]) / poses[:, GAIN]
     measured = births * np.maximum(now, 1.0) / np.maximum(means, 1.0)
     return measured / (np.median((measured / brightness(poses))[rows]) if rows.any() else 1.0)
+
+
+def exposure(poses: F64, births: F64, means: F64, rows: BoolArray) -> float:
+    """Exposure of a frame relative to the first one, from surfels that are aligned with it.
+
+    As above; 1 without rows.
+    """
+    everyone = np.zeros(len(poses), np.bool_)
+    measured = measured_brightness(poses, births, means, np.zeros(len(poses)), everyone)
+    return float(np.median((measured / brightness(poses))[rows])) if rows.any() else 1.0
 
 
 @fast_kernel

@@ -191,15 +191,17 @@ def _median_strains(edges: Edges, residuals: F64, out: F64) -> None:
             out[s] = np.median(values[starts[s] : starts[s + 1]])
 
 
-def median_strains(poses: F64, edges: Edges) -> F64:
+def median_strains(poses: F64, edges: Edges, known: BoolArray) -> F64:
     """(N,) median of |X_j - X_i - (R_i + R_j) d / 2| / |d| over each surfel's edges.
 
-    Half of its neighbours agree with a surfel to within this share of their distance.  NaN without
-    edges.
+    known: (N,) surfels that are compared.  Half of its neighbours agree with a surfel to within
+    this share of their distance.  NaN without edges between known ones.
     """
     out = np.full(len(poses), np.nan)
-    if len(edges.ends):
-        _median_strains(edges, edge_rows(poses, edges)[1], out)
+    rows = known[edges.ends].all(axis=1)
+    used = Edges(edges.ends[rows], edges.first[rows], edges.second[rows], edges.lengths[rows])
+    if len(used.ends):
+        _median_strains(used, edge_rows(poses, used)[1], out)
     return out
 
 

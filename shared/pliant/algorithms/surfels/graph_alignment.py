@@ -105,7 +105,7 @@ def _eliminate_all(
         models.mixing(poses[s], level, model, work.mix)
         models.hessian(matrices[s], 1.0, work.mix, n, work.product, H)
         models.gradient(sums[s], work.mix, n, g)
-        add_isometry(poses[s], limits, H, g)
+        add_isometry(poses[s], limits, 1.0, H, g)
         for r in range(m):
             for c in range(m):
                 block[r, c] = H[RIGID + r, RIGID + c]

@@ -338,7 +338,7 @@ def align_all(poses: F64, active: U8, equilibrium: Equilibrium, matcher: Matcher
                 for row in range(n):
                     copy(work.photometric[row], work.H[row])
                 _add_rest(pose, point, weight, work.H, work.g)
-                add_isometry(pose, limits, work.H, work.g)
+                add_isometry(pose, limits, 1.0, work.H, work.g)
             bound = max(damping, limits.first_lambda) if accepted < limits.damped_steps else damping
             if not factorise(work.H, n, n - 2, bound, work.L, work.inverse):
                 break
@@ -396,12 +396,12 @@ def _squared_strain(pose: F64) -> float:
 
 
 @fast_kernel
-def add_isometry(pose: F64, limits: Limits, H: F64, g: F64) -> None:
-    """Add its matrix and half of its gradient, for the general model."""
+def add_isometry(pose: F64, limits: Limits, weight: float, H: F64, g: F64) -> None:
+    """Add ``weight`` times its matrix and half of its gradient, for the general model."""
     if limits.model != models.GENERAL or limits.isometry == 0.0:
         return
     f = 1.0 + _squared_strain(pose) * limits.isometry
-    w = OMEGA_E * limits.isometry * math.sqrt(math.sqrt(f)) / f
+    w = weight * OMEGA_E * limits.isometry * math.sqrt(math.sqrt(f)) / f
     for k, share, rest in ((0, w, 1.0), (1, 2.0 * w, 0.0), (2, w, 1.0)):
         g[models.RIGID + k] += share * (pose[F + k] - rest)
         H[models.RIGID + k, models.RIGID + k] += share

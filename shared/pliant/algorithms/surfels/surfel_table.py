@@ -50,7 +50,8 @@ class SurfelTable:
     poses: F64 = field(default_factory=lambda: np.zeros((0, POSE_FLOATS)))  # last good ones
     rest: F64 = field(default_factory=lambda: np.zeros((0, 3)))  # X^0 of Eq. 20, world
     sigmas: F64 = field(default_factory=lambda: np.zeros(0))  # root of its Sigma, metres
-    brightness: F64 = field(default_factory=lambda: np.zeros(0))  # at birth, see ``brightness``
+    # At birth, at the exposure of the first frame: see ``brightness``.
+    brightness: F64 = field(default_factory=lambda: np.zeros(0))
     ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
     state: U8 = field(default_factory=lambda: np.zeros(0, np.uint8))
     born: I32 = field(default_factory=lambda: np.zeros(0, np.int32))
@@ -64,9 +65,13 @@ class SurfelTable:
         return len(self.ids)
 
     def add(
-        self, births: Births, T_world_camera: F64, first_id: int, frame: int, sigmas: F64
-    ) -> None:
-        """Append new surfels, with ids from ``first_id`` on."""
+        self, births: Births, T_world_camera: F64, first_id: int, frame: int, sigmas: F64,
+        exposure: float = 1.0,
+    ) -> None:  # fmt: skip
+        """Append new surfels, with ids from ``first_id`` on.
+
+        exposure: of their frame, relative to the first.
+        """
         n = len(births.poses)
         poses = move_poses(births.poses, T_world_camera)
         validations = new_validations(n)
@@ -83,7 +88,7 @@ class SurfelTable:
         self.tried = np.concatenate([self.tried, poses[:, X : X + 3]])
         self.rest = np.concatenate([self.rest, poses[:, X : X + 3]])
         self.sigmas = np.concatenate([self.sigmas, sigmas])
-        self.brightness = np.concatenate([self.brightness, brightness(births.poses)])
+        self.brightness = np.concatenate([self.brightness, exposure * brightness(births.poses)])
         self.ids = np.concatenate([self.ids, np.arange(first_id, first_id + n)])
         self.state = np.concatenate([self.state, np.zeros(n, np.uint8)])
         self.born = np.concatenate([self.born, np.full(n, frame, np.int32)])
@@ -136,9 +141,14 @@ class SurfelTable:
 
 
 def frame_of(
-    table: SurfelTable, *, frame: int, segment: int, lost: bool, T_world_camera: F64
-) -> SurfelFrame:
-    """Return the published state of the surfels in a frame."""
+    table: SurfelTable, *, frame: int, segment: int, lost: bool, T_world_camera: F64,
+    depth_is_known: bool = True,
+) -> SurfelFrame:  # fmt: skip
+    """Return the published state of the surfels in a frame.
+
+    depth_is_known: whether surfels begin with a depth that was measured.
+    """
+    ages = (frame - table.born).astype(np.int32)
     poses, validations = table.poses, table.validations
     f11, f12, f22 = (poses[:, F + k, None] for k in range(3))
     a, b = poses[:, A : A + 3], poses[:, B : B + 3]
@@ -161,25 +171,31 @@ def frame_of(
         gains=_f32(poses[:, GAIN]),
         biases=_f32(biases),
         state=table.state.copy(),
-        age=(frame - table.born).astype(np.int32),
+        age=ages,
         born=table.born.copy(),
         tried=table.tried.copy(),
         birth_zncc=_f32(table.birth_zncc),
         confirmed=table.confirmed.astype(np.uint8),
-        confidence=_f32(_confidence(table)),
+        confidence=_f32(_confidence(table, ages, depth_is_known=depth_is_known)),
     )
 
 
-def _confidence(table: SurfelTable) -> F64:
+def _confidence(table: SurfelTable, ages: I32, *, depth_is_known: bool) -> F64:
     """(N,) probability that a position is within 1 % of its depth.
 
     The neighbours decide: an error of depth changes hardly any pixel, but strains the edges.  An
-    error that all of them share strains nothing.  A surfel without edges has the ZNCC with its
-    birth template.
+    error that all of them share strains nothing.  Only surfels that are both tracked are compared:
+    the others have old positions.  Without such edges the ZNCC with the birth template remains, and
+    half of it where a surfel is not tracked.
+
+    A new surfel agrees with its neighbours by its birth.  On made-up depth that tells nothing, so
+    there each frame counts as one trial (rule of succession).
     """
-    strains = median_strains(table.poses, table.edges)
+    strains = median_strains(table.poses, table.edges, table.tracked)
     agreement = 1.0 / (1.0 + (strains / _EVEN_STRAIN) ** _STEEPNESS)
-    return np.where(np.isnan(strains), np.clip(table.birth_zncc, 0.0, 1.0), agreement)
+    likeness = np.clip(table.birth_zncc, 0.0, 1.0) * np.where(table.tracked, 1.0, 0.5)
+    confidence = np.where(np.isnan(strains), likeness, agreement)
+    return confidence if depth_is_known else confidence * (ages + 1.0) / (ages + 2.0)
 
 
 def _f32(values: F64) -> F32:

@@ -9,6 +9,7 @@ from pliant.algorithms.slam.places.place_index import Features, describe
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.surfels import validation
 from pliant.algorithms.surfels.births import find_births
+from pliant.algorithms.surfels.brightness import exposure
 from pliant.algorithms.surfels.camera_alignment import align_rigid, fit_camera, spread
 from pliant.algorithms.surfels.deformation_models import MODELS, move_poses
 from pliant.algorithms.surfels.depth_maps import depth_between
@@ -43,6 +44,8 @@ _KEPT = 0.7
 """Minimum share of the previous frame's tracked surfels; below it, views are searched."""
 _FOUND_BACK = 0.5
 """Minimum share of the surfels with agreeing corners that are then tracked."""
+_BY_CHANCE = 0.2
+"""After a loss fewer than this share of the surfels may be tracked in another scene by chance."""
 _EARLIER = 2
 """Number of stored earlier segments that may resume: some 15 MB each."""
 _BLEND, _COARSE_STATIC_BLEND = 1.0, 0.5
@@ -68,7 +71,8 @@ class SurfelTracker:
         self._camera: PinholeCamera | None = None
         self._T_world_camera: F64 = np.eye(4)
         self._frame, self._segment, self._segments, self._next_id = 0, 0, 0, 0
-        self._interval_s, self._lost, self._since_birth_s = 0.0, True, 0.0
+        self._interval_s, self._lost = 0.0, True
+        self._lost_for_s = 0.0
         self._views = RememberedViews()
         self._earlier: dict[int, SurfelTable] = {}
 
@@ -83,6 +87,7 @@ class SurfelTracker:
         self._camera = camera
         self._table, self._frame, self._next_id = SurfelTable(), 0, 0
         self._segment = self._segments = 0
+        self._lost_for_s = 0.0
         self._views, self._earlier = RememberedViews(), {}
         self._T_world_camera = np.eye(4) if T_world_camera is None else T_world_camera.copy()
         pyramid = self._pyramid(image)
@@ -118,6 +123,7 @@ class SurfelTracker:
         with timer("templates"):
             self._update_templates(pyramid)
         self._since_birth_s += interval_s
+        self._count_lost_seconds()
         if self._parameters.depth_from == "flat":
             depth = self._made_up_depth()
         if depth is not None:
@@ -188,13 +194,25 @@ class SurfelTracker:
             self._go_on(found, tables, pyramid)
         return seen
 
+    def _count_lost_seconds(self) -> None:
+        followed = int(self._table.tracked.sum())
+        by_chance = self._lost_for_s > 0.0 and followed < _BY_CHANCE * self._followed
+        if self._lost or by_chance:
+            self._lost_for_s += self._interval_s
+        else:
+            self._lost_for_s, self._followed = 0.0, followed
+
     def _made_up_depth(self) -> F64 | None:
-        """Depth for births on ``flat``, as often as places become free."""
-        table, camera = self._table, self._camera
+        """Depth for births on ``flat``, as often as places become free.
+
+        A scene that is missing for a single frame, covered or blurred, is no other scene.
+        """
+        table, p, camera = self._table, self._parameters, self._camera
         assert camera is not None
-        if self._since_birth_s < self._parameters.lost_after_s:
+        if self._since_birth_s < p.lost_after_s or 0.0 < self._lost_for_s < p.lost_after_s:
             return None
-        if self._lost:
+        if self._lost_for_s > 0.0:
+            self._lost = True
             return np.ones((camera.height, camera.width))
         points = table.validations[table.tracked, validation.U : validation.V + 1]
         there = transform(inverse(self._T_world_camera), table.poses[table.tracked, X : X + 3])
@@ -391,13 +409,24 @@ class SurfelTracker:
             table.keep(np.sort(newest))
         # The heuristic covariance of section V: a share of the surfel's depth, all directions.
         sigmas = np.maximum(p.expected_motion * births.poses[:, X + 2], 1e-9)
-        table.add(births, self._T_world_camera, self._next_id, self._frame, sigmas)
+        table.add(
+            births, self._T_world_camera, self._next_id, self._frame, sigmas, self._exposure()
+        )
         table.connect(len(table) - n, p.neighbours, with_earlier=not flat)
         self._next_id += n
-        self._lost = int(table.tracked.sum()) < p.min_alive
+        self._followed = int(table.tracked.sum())
+        self._lost = self._followed < p.min_alive
         rows = (table.born == self._frame).astype(np.uint8)
         poses = move_poses(table.poses, inverse(self._T_world_camera))
         validation.validate_all(poses, rows, self._matcher(0, pyramid[0]), table.validations)
+
+    def _exposure(self) -> float:
+        """Of the last frame relative to the first of this segment, where brightness counts."""
+        table = self._table
+        if self._parameters.light != "camera" or not table.tracked.any():
+            return 1.0
+        poses = move_poses(table.poses, inverse(self._T_world_camera))
+        return exposure(poses, table.brightness, table.templates[0].means, table.tracked)
 
     def _update_templates(self, pyramid: list[Level]) -> None:
         if self._lost or not len(self._table):
@@ -433,6 +462,7 @@ class SurfelTracker:
         return frame_of(
             self._table, frame=self._frame, segment=self._segment, lost=self._lost,
             T_world_camera=self._T_world_camera,
+            depth_is_known=self._parameters.depth_from != "flat",
         )  # fmt: skip
 
 

@@ -16,7 +16,9 @@ from pliant.algorithms.surfels.patch_sampling import (
 )
 from pliant.algorithms.surfels.photometric import correlation, first_inner
 from pliant.algorithms.surfels.surfel_alignment import (
+    OMEGA_E,
     Matcher,
+    add_isometry,
     factorise,
     inverse_diagonal,
 )
@@ -67,6 +69,8 @@ def validate_all(poses: F64, active: U8, matcher: Matcher, out: F64) -> None:
             templates.matrices[s], row[VISIBLE], work.mix, parameters, work.product, work.H
         )
         noise = max(squares / seen, _MIN_NOISE * _MIN_NOISE)
+        # The soft isometry is known in DN^2 of variance OMEGA_E, whatever the noise of the image.
+        add_isometry(pose, limits, noise / OMEGA_E, work.H, work.g)
         if factorise(work.H, parameters, parameters, 0.0, work.L, work.inverse):
             trace = inverse_diagonal(work.L, work.inverse, parameters, 3, work.step)
             row[SIGMA] = min(math.sqrt(noise * trace), _MAX_SIGMA)

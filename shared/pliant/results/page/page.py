@@ -71,7 +71,8 @@ def table_rows(told: Iterable[tuple[str, str]]) -> str:
 def canvas(scene: Scene) -> str:
     """The rotatable view."""
     return (
-        '<canvas id="view"></canvas><p class="soft"><span id="layers"></span> drag to '
+        '<canvas id="view"></canvas><p id="time"></p><p class="soft">'
+        '<span id="layers"></span> drag to '
         "rotate, shift-drag to move, wheel or pinch to zoom, double-click two points to "
         'measure</p><p id="picked"></p><script type="application/json" '
         f'id="scene">{scene.header}</script><script type="text/plain" '

@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, U8
+from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.meshing.decimation import decimated
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.formats.textured import TexturedMesh
@@ -27,6 +27,23 @@ _RIM = 0.005
 
 
 @dataclass(frozen=True)
+class MovingMesh:
+    """A mesh for each of K key frames, one after the other.
+
+    positions: (V, 3).    colours: (V, 3) RGB.    triangles: (T, 3), seen from both sides.
+    first_vertices, first_triangles: (K,) of each key frame.    names, times_s: of the key frames.
+    """
+
+    positions: F64
+    colours: U8
+    triangles: I32
+    first_vertices: I64
+    first_triangles: I64
+    names: list[str]
+    times_s: list[float]
+
+
+@dataclass(frozen=True)
 class Scene:
     """header: JSON for viewer.js.    bytes: base64."""
 
@@ -38,14 +55,14 @@ def make_scene(
     points: F64,
     colours: U8,
     T_world_camera: F64,
-    mesh: TriangleMesh | TexturedMesh | None,
+    mesh: TriangleMesh | TexturedMesh | MovingMesh | None,
     places: F64 | None = None,
     *,
     frame_path: bool = True,
 ) -> Scene:
     """Points (P, 3), the camera's path (N, 4, 4), N >= 1, and the mesh, as many as a page carries.
 
-    mesh: with a texture it is shown as it is, else decimated.
+    mesh: with a texture, or if it moves, it is shown as it is, else decimated.
     places: (L, 2, 3) lines between what shows one place.    frame_path: whether the path is in view
     at first, or the surface alone, which fills the canvas then.
 
@@ -59,13 +76,17 @@ def make_scene(
     shown = cloud
     tints: U8 | None = None
     uvs: F32 | None = None
-    vertices, triangles = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
+    vertices: F32 | F64 = np.zeros((0, 3), np.float32)
+    triangles = np.zeros((0, 3), np.int32)
     if isinstance(mesh, TexturedMesh):
         vertices, triangles, uvs = mesh.positions, mesh.triangles, mesh.uvs
+    elif isinstance(mesh, MovingMesh):
+        vertices, tints, triangles = mesh.positions, mesh.colours, mesh.triangles
     elif mesh is not None and len(mesh.triangles):
         vertices, tints, triangles = decimated(*_outwards(mesh), MAX_TRIANGLES)
     near = ((vertices >= low - size) & (vertices <= high + size)).all(axis=1)
-    triangles = triangles[near[triangles].all(axis=1)]
+    inner = near[triangles].all(axis=1)
+    triangles = triangles[inner]
     if len(triangles):
         shown = vertices[np.unique(triangles)]
         low, high = np.minimum(low, shown.min(axis=0)), np.maximum(high, shown.max(axis=0))
@@ -73,6 +94,8 @@ def make_scene(
     block = _Block(low, size)
     if mesh is not None and len(mesh.triangles):
         block.add("mesh", vertices, tints, triangles, uvs)
+        if isinstance(mesh, MovingMesh):
+            block.layers[-1]["keys"] = _keys(mesh, inner)
     inside = ((points >= low) & (points <= high)).all(axis=1)
     step = max(1, -(-int(inside.sum()) // MAX_POINTS))
     block.add("points", points[inside][::step], colours[inside][::step])
@@ -100,6 +123,22 @@ def make_scene(
         _, image = cv2.imencode(".webp", mesh.texture[:, :, ::-1], quality)
         header["texture"] = f"data:image/webp;base64,{base64.b64encode(image.tobytes()).decode()}"
     return Scene(json.dumps(header), base64.b64encode(b"".join(block.parts)).decode())
+
+
+def _keys(mesh: MovingMesh, kept: BoolArray) -> list[dict[str, Any]]:
+    """Where each key frame begins and ends.  kept: (T,) triangles that are shown."""
+    triangles = np.concatenate([[0], np.cumsum(kept)])
+    firsts = triangles[np.append(mesh.first_triangles, len(kept))].tolist()
+    vertices = np.append(mesh.first_vertices, len(mesh.positions)).tolist()
+    return [
+        {
+            "name": name,
+            "time": time_s,
+            "triangles": firsts[k : k + 2],
+            "vertices": vertices[k : k + 2],
+        }
+        for k, (name, time_s) in enumerate(zip(mesh.names, mesh.times_s, strict=True))
+    ]
 
 
 def _framed(places: F64 | F32, path: F64, view: MapView) -> tuple[F64, float]:

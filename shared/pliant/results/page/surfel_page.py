@@ -10,11 +10,6 @@ from pliant.results.page.moved_surface import Surface
 from pliant.results.page.page import bullets, canvas, ended, fill_page, table_rows
 from pliant.wording import counted
 
-_TINTS = (
-    '<p class="soft">The surface in the last tracked frame. Colours show the motion of each '
-    "part since its first frame, from blue (least) to red (most).</p>"
-)
-
 
 def write_surfel_page(
     path: Path, report: dict[str, Any], lines: list[str], surface: Surface | None,
@@ -29,12 +24,21 @@ def write_surfel_page(
         path, report, names,
         verdict=escape(report["verdict"]),
         reason=escape(report["verdict_reason"]),
-        map="" if surface is None else canvas(surface.scene()) + _TINTS,
+        map="" if surface is None else _view(surface),
         clip="",
         figures=table_rows(_surfel_figures(report)),
         chart=_surfel_chart(report),
         advice=bullets("Further messages", lines),
     )  # fmt: skip
+
+
+def _view(surface: Surface) -> str:
+    scene, full = surface.scene()
+    return (
+        f'{canvas(scene)}<p class="soft">The surface in key frames. Colours show the strain of '
+        "each part since the first key frame that shows it: blue is compressed, grey unchanged, "
+        f"red stretched, by {100.0 * full:.1f} % or more in the full colour.</p>"
+    )
 
 
 def _surfel_figures(report: dict[str, Any]) -> list[tuple[str, str]]:

@@ -71,6 +71,43 @@ function begin() {
     box.append(label);
   }
 
+  // A surface that moves has a mesh for each key frame; the last one is shown at first.
+  const moving = layers.find((layer) => layer.keys);
+  let key = moving ? moving.keys.length - 1 : 0;
+  if (moving) addSlider();
+
+  function addSlider() {
+    const [slider, play, name] = ["input", "button", "output"].map((kind) => document.createElement(kind));
+    const { keys } = moving, last = keys.length - 1;
+    Object.assign(slider, { type: "range", max: last, value: last, ariaLabel: "key frame" });
+    const show = (number) => {
+      key = number;
+      slider.value = key;
+      name.textContent = `${keys[key].name}, ${keys[key].time.toFixed(2)} s`;
+    };
+    let started = null;
+    const step = (now) => {
+      if (started === null) return;
+      const time = keys[0].time + 0.001 * (now - started);
+      let at = keys.findIndex((each) => each.time > time);
+      if (at < 0) [at, started] = [keys.length, null];
+      show(Math.max(at - 1, 0));
+      if (started === null) play.textContent = "Play";
+      else requestAnimationFrame(step);
+      draw();
+    };
+    play.textContent = "Play";
+    play.onclick = () => {
+      const from = key < last ? keys[key].time : keys[0].time;
+      started = started === null ? performance.now() - 1000 * (from - keys[0].time) : null;
+      play.textContent = started === null ? "Play" : "Stop";
+      if (started !== null) requestAnimationFrame(step);
+    };
+    slider.oninput = () => { started = null; play.textContent = "Play"; show(Number(slider.value)); draw(); };
+    show(last);
+    document.getElementById("time").append(play, slider, name);
+  }
+
   // The eye goes round a point: turn about the world's up, height over it, and distance.
   const view = { turn: 0, height: header.height, distance: header.distance, target: [...header.target] };
   const [right0, up, forward0] = header.axes;
@@ -115,7 +152,8 @@ function begin() {
   function nearest(px, py) {
     let found = null, depth = Infinity;
     for (const layer of layers.filter((each) => each.shown && !each.line)) {
-      const shares = new Uint16Array(bytes, layer.places, 3 * layer.count);
+      const [from, to] = layer.keys ? layer.keys[key].vertices : [0, layer.count];
+      const shares = new Uint16Array(bytes, layer.places + 6 * from, 3 * (to - from));
       for (let n = 0; n < shares.length; n += 3) {
         const place = [0, 1, 2].map((k) => header.low[k] + shares[n + k] / 65535 * header.size[k]);
         const { x, y, w } = seenAt(place);
@@ -150,7 +188,9 @@ function begin() {
       gl.bindVertexArray(layer.array);
       gl.uniform1f(places.lit, layer.triangles ? 1 : 0);
       gl.uniform1f(places.textured, layer.uvs === undefined ? 0 : 1);  // photographs have their light
-      if (layer.triangles) gl.drawElements(gl.TRIANGLES, 3 * layer.triangles, gl.UNSIGNED_INT, 0);
+      const [from, to] = layer.keys ? layer.keys[key].triangles : [0, layer.triangles];
+      layer.keys ? gl.disable(gl.CULL_FACE) : gl.enable(gl.CULL_FACE);  // a cloth has no inside
+      if (layer.triangles) gl.drawElements(gl.TRIANGLES, 3 * (to - from), gl.UNSIGNED_INT, 12 * from);
       else gl.drawArrays(layer.pairs ? gl.LINES : layer.line ? gl.LINE_STRIP : gl.POINTS, 0, layer.count);
     }
     gl.bindVertexArray(marks.array);
