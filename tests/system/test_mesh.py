@@ -127,6 +127,34 @@ def test_the_mesh_is_made_again_with_other_parameters(result: Path, tmp_path: Pa
     assert_one_line(in_this_process("mesh", result, "--output", result), "is read from there")
 
 
+def test_a_mesh_made_again_is_evaluated_with_the_poses_of_its_run(
+    result: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "made").mkdir()
+    run = shutil.copytree(result, tmp_path / "made" / "run")
+    done = pliant("mesh", run, "--set", "meshing.depth=points")
+    assert done.returncode == 0, done.stderr
+    moved = (tmp_path / "made").rename(tmp_path / "moved")
+    meshed = moved / "run_mesh"
+    # What the user had to do before: the mesh in a folder of the run.
+    by_hand = shutil.copytree(result, tmp_path / "by_hand")
+    for mesh in meshed.glob("mesh*.ply"):
+        shutil.copy(mesh, by_hand)
+    found: list[object] = []
+    for folder in (meshed, by_hand):
+        figures = tmp_path / "figures.json"
+        done = pliant("eval", folder, "-g", TINY, "--mesh", "--json", figures, "--force")
+        assert done.returncode == 0, done.stderr
+        content = json.loads(figures.read_text())
+        found.append((content["final"], content["mesh"], content["mesh_coarse"]))
+        assert (folder / "mesh_error.png").exists()
+    assert found[0] == found[1]
+    assert not (moved / "run" / "mesh_error.png").exists()
+    (moved / "run").rename(moved / "elsewhere")
+    gone = in_this_process("eval", meshed, "-g", TINY, "--mesh")
+    assert_one_line(gone, "recording.mcap is gone")
+
+
 def test_a_voxel_too_small_for_the_memory_is_refused_before_the_work(
     result: Path, tmp_path: Path
 ) -> None:

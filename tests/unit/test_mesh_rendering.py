@@ -68,6 +68,9 @@ def test_samples_of_a_wall_and_what_is_within_a_distance() -> None:
     assert share_within(others, NONE, 1.0) == share_within(NONE, others, 1.0) == 0.0
 
 
+STILL = Similarity(scale=1.0, R=np.eye(3), t=np.zeros(3))
+
+
 def evaluate(points: np.ndarray, faces: np.ndarray, scale: float = 1.0) -> MeshEvaluation:
     normals = np.tile(np.array([0.0, 0.0, -1.0], np.float32), (len(points), 1))
     no_colours = np.zeros((0, 3), np.uint8)
@@ -97,6 +100,31 @@ def test_a_wall_ten_percent_too_far_is_so_until_its_scale_is_fitted() -> None:
     assert found.within == found.f_score == 0.0
     assert abs(found.fitted_scale - 1.0 / 1.1) < 1e-3
     assert found.fitted_median_error < 1e-3
+
+
+def test_normals_of_ground_truth_with_the_noise_of_a_depth_camera() -> None:
+    """Slopes between pixels magnify it; planes of windows average it out."""
+    normal = np.array([0.3, -0.2, -1.0])
+    normal /= np.linalg.norm(normal)
+    generator = np.random.default_rng(0)
+    u, v = np.meshgrid(np.arange(80.0), np.arange(60.0))
+    rays = np.dstack([CAMERA.normalise(np.dstack([u, v]).reshape(-1, 2)).reshape(60, 80, 2),
+                      np.ones_like(u)])  # fmt: skip
+    exact = -3.0 / (rays @ normal)
+    noisy = exact * (1.0 + 0.001 * generator.standard_normal(exact.shape))
+    points = (rays * exact[..., None])[::59, ::79].reshape(-1, 3).astype(np.float32)
+    faces = np.array([[0, 1, 2], [1, 3, 2]], np.int32)
+    for depth, noise in ((exact, 0.0), (noisy, 2.5)):
+        mesh = TriangleMesh(
+            positions=points, normals=np.tile(normal.astype(np.float32), (4, 1)),
+            colours=np.zeros((4, 3), np.uint8), triangles=faces,
+        )  # fmt: skip
+        evaluation = MeshEvaluation(mesh, STILL, CAMERA)
+        evaluation.add(depth, np.eye(4), np.eye(4))
+        found = evaluation.result()
+        assert found.plane_normal_deg < 0.05 + 0.7 * noise
+        for magnified in (found.normal_deg, found.truth_noise_deg):
+            assert noise <= magnified < 0.05 + 4.0 * noise
 
 
 def test_no_mesh_covers_nothing() -> None:

@@ -25,13 +25,20 @@ from pliant.recording.parts import parts_of
 from pliant.recording.summary import summarise
 from pliant.results.folder import keep_apart, written
 from pliant.results.known_scale import MetricRecording
-from pliant.results.mesh_files import mesh_of, mesh_report, meshes_of, write_mesh, write_meshes
+from pliant.results.mesh_files import (
+    MESHED_NAME,
+    mesh_of,
+    mesh_report,
+    meshes_of,
+    place_of,
+    write_mesh,
+    write_meshes,
+)
 from pliant.results.run import folded_map
 from pliant.wording import counted
 from pliant_services.processes import BY_NAME
 from pliant_services.replay.services import run_on
 
-REPORT_NAME = "mesh.json"
 _MESHING = BY_NAME["meshing"]
 
 
@@ -97,14 +104,14 @@ def run_mesh(
         if clean:
             found.pieces = list(_changed(found.pieces, cleaned))
         write_all(output, found, folded_map(recording))
-        report = {
+        report = place_of(recording, output) | {
             "mesh": mesh_report(found.pieces),
             "seconds": found.seconds,
             "counters": found.counters,
             "notes": found.notes,
             "config": config.meshing.model_dump(mode="json"),
         }
-        write_whole(output / REPORT_NAME, json.dumps(report, indent=1) + "\n")
+        write_whole(output / MESHED_NAME, json.dumps(report, indent=1) + "\n")
         if close:
             yield from write_watertight(output, found, folded_map(recording).longest_segment())
     for mesh in mesh_report(found.pieces):
@@ -121,7 +128,7 @@ def run_mesh(
 
 def is_meshed(result: Path, output: Path | None) -> bool:
     """Whether the mesh of a result folder is there, whole: its report is written last."""
-    return ((output or _beside(result.resolve())) / REPORT_NAME).exists()
+    return ((output or _beside(result.resolve())) / MESHED_NAME).exists()
 
 
 def _beside(folder: Path) -> Path:

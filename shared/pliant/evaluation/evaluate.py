@@ -22,6 +22,7 @@ from pliant.evaluation.run_evaluation import Evaluation, evaluate_result
 from pliant.evaluation.time_offset import TimeOffset
 from pliant.open3d_library import load_open3d
 from pliant.results.folder import PAGE_NAME, check_free, files_read, keep_apart
+from pliant.results.mesh_files import run_of
 from pliant.results.page.page import put_truth_in
 
 
@@ -85,11 +86,12 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
     if request.tracks:
         from pliant.evaluation.truth import tracks_against_truth
 
-        yield from tracks_against_truth(request.results[0], truth, figures)
+        yield from tracks_against_truth(run_of(request.results[0]), truth, figures)
     if request.points:
         from pliant.evaluation.truth import points_against_truth
 
-        yield from points_against_truth(request.results[0], truth, evaluations[0], figures)
+        run = run_of(request.results[0])
+        yield from points_against_truth(run, truth, evaluations[0], figures)
     if request.mesh:
         from pliant.evaluation.recorded_mesh import mesh_against_truth
 
@@ -106,7 +108,7 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
 def _evaluated(result: Path, truth: Path, request: EvaluationRequest) -> Evaluation:
     """Evaluate one result.  Raises ResultError if poses and ground truth do not overlap in time."""
     evaluation = evaluate_result(
-        result,
+        run_of(result),
         groundtruth=truth,
         times=request.times,
         frames=request.frames,
@@ -151,7 +153,8 @@ def _check_outputs(request: EvaluationRequest) -> None:
     It may be a new one beside what is read.
     """
     truth = Path(request.groundtruth)
-    read = [truth, *(file for each in request.results for file in [each, *files_read(each)])]
+    folders = [folder for each in request.results for folder in (each, run_of(each))]
+    read = [truth, *(file for each in folders for file in [each, *files_read(each)])]
     read += [truth.with_name("times.txt") if request.times is None else request.times]
     read += [] if request.scan is None else [request.scan]
     for option, path in (("--json", request.json), ("--plot", request.plot)):

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, BoolArray
@@ -19,6 +20,10 @@ SURFACE_LIMIT = 0.01
 """Share of the scene's diameter within which two surfaces are the same, for the F-score."""
 _SPACING = 0.25
 """Distance of the samples of a surface, as a share of the limit."""
+_PLANE_SHARE = 1 / 128
+"""Of the width: how far the window reaches to each side whose plane is a smooth true normal."""
+_PLANE_KNOWN = 0.9
+"""Minimum share of such a window that is on one surface."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +34,9 @@ class MeshTruth:
     covered ones, relative.    within: share of the covered ones within 5 %.
     fitted_scale: the scale that makes depths fit best, over that of the trajectory; 1 is best.
     fitted_median_error, fitted_within: as above, with that scale.
-    normal_deg: median angle to the true normal, away from jumps in depth.
+    normal_deg: median angle to the true normal, away from jumps in depth.    plane_normal_deg: to
+    that of planes fitted to the true depth.    truth_noise_deg: between these two, the noise of a
+    depth camera, without which ``normal_deg`` means nothing.
     diameter_m: diagonal of the box about the true surface.    precision, recall, f_score: at 1 %
     of it, against the true surface that the views see.
     closed_covered, closed_median_error, closed_within: as above, with the scale that fits, of what
@@ -45,6 +52,8 @@ class MeshTruth:
     fitted_median_error: float
     fitted_within: float
     normal_deg: float
+    plane_normal_deg: float
+    truth_noise_deg: float
     diameter_m: float
     precision: float
     recall: float
@@ -68,6 +77,8 @@ class MeshEvaluation:
     _ratios: list[F32] = field(default_factory=list[F32])
     _closing: list[BoolArray] = field(default_factory=list[BoolArray])
     _angles: list[F32] = field(default_factory=list[F32])
+    _plane_angles: list[F32] = field(default_factory=list[F32])
+    _noise: list[F32] = field(default_factory=list[F32])
     _surface: list[F64] = field(default_factory=list[F64])
     _floor: list[F64] = field(default_factory=list[F64])
     _known: int = 0
@@ -86,10 +97,13 @@ class MeshEvaluation:
         self._known += int(known.sum())
         normals = seen.interpolate(self.mesh.triangles, self.mesh.normals) @ T_estimate[:3, :3]
         true, smooth = _true_normals(view)
-        smooth &= both
-        cosine = (_unit(normals[smooth]) * true[smooth]).sum(axis=1)
-        angles = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        self._angles.append(angles.astype(np.float32))
+        planes, flat = _plane_normals(view)
+        for angles, a, b, where in (
+            (self._angles, normals, true, smooth & both),
+            (self._plane_angles, normals, planes, flat & both),
+            (self._noise, planes, true, flat & smooth),
+        ):
+            angles.append(_angles_deg(a[where], b[where]))
         v, u = np.nonzero(known)
         rays = self.camera.normalise(np.stack([u, v], axis=1).astype(np.float64))
         points = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
@@ -111,7 +125,6 @@ class MeshEvaluation:
         """The figures over all views."""
         nan = float("nan")
         ratios = np.concatenate([np.zeros(0, np.float32), *self._ratios])
-        angles = np.concatenate([np.zeros(0, np.float32), *self._angles])
         scale = 1.0 / float(np.median(ratios)) if len(ratios) else nan
         errors, fitted = np.abs(ratios - 1.0), np.abs(ratios * scale - 1.0)
         closing = fitted[np.concatenate([np.zeros(0, np.bool_), *self._closing])]
@@ -127,7 +140,9 @@ class MeshEvaluation:
             fitted_scale=scale,
             fitted_median_error=float(np.median(fitted)) if len(fitted) else nan,
             fitted_within=float(np.mean(fitted <= DEPTH_LIMIT)) if len(fitted) else nan,
-            normal_deg=float(np.median(angles)) if len(angles) else nan,
+            normal_deg=_median_of(self._angles),
+            plane_normal_deg=_median_of(self._plane_angles),
+            truth_noise_deg=_median_of(self._noise),
             diameter_m=diameter,
             precision=precision,
             recall=recall,
@@ -190,7 +205,9 @@ def format_mesh(truth: MeshTruth) -> str:
         f"relative error of depth: median {100 * t.median_error:.2f} %, "
         f"{100 * t.within:.1f} % within 5 %; with depths scaled by {t.fitted_scale:.4f} to fit "
         f"best: median {100 * t.fitted_median_error:.2f} %, {100 * t.fitted_within:.1f} %\n"
-        f"normals: median angle to ground truth {t.normal_deg:.1f} deg\n"
+        f"normals: median angle to ground truth {t.normal_deg:.1f} deg; to its planes "
+        f"{t.plane_normal_deg:.1f} deg, from which ground truth itself is {t.truth_noise_deg:.1f} "
+        "deg off\n"
         f"surface within 1 % of the diameter ({t.diameter_m:.2f} m): F-score {t.f_score:.3f}, "
         f"precision {t.precision:.3f}, recall {t.recall:.3f}"
         + (closed if t.closed_covered > 0.0 else "")
@@ -202,7 +219,19 @@ def _unit(vectors: F32 | F64) -> F64:
     return np.asarray(vectors / np.maximum(lengths, 1e-12), np.float64)
 
 
-def _true_normals(view: DepthView) -> tuple[F64, "np.ndarray[tuple[int, ...], np.dtype[np.bool_]]"]:
+def _angles_deg(a: F64, b: F64) -> F32:
+    """(N,) between vectors (N, 3) and unit vectors (N, 3), degrees."""
+    cosines = np.clip((_unit(a) * b).sum(axis=1), -1.0, 1.0)
+    return np.degrees(np.arccos(cosines)).astype(np.float32)
+
+
+def _median_of(angles: list[F32]) -> float:
+    """NaN where there are none."""
+    every = np.concatenate([np.zeros(0, np.float32), *angles])
+    return float(np.median(every)) if len(every) else float("nan")
+
+
+def _true_normals(view: DepthView) -> tuple[F64, BoolArray]:
     """(H, W, 3) normals in the camera, towards it, and where they are defined.
 
     Inverse depth is affine on a plane: w = n . ray, so its differences are n_u / fx and n_v / fy.
@@ -217,4 +246,40 @@ def _true_normals(view: DepthView) -> tuple[F64, "np.ndarray[tuple[int, ...], np
     defined = ~view.broken
     defined[[0, -1]] = False
     defined[:, [0, -1]] = False
+    return -_unit(normals), defined
+
+
+def _plane_normals(view: DepthView) -> tuple[F64, BoolArray]:
+    """(H, W, 3) likewise, of planes fitted to windows of inverse depth by least squares.
+
+    Depth cameras have steps and noise that slopes between pixels side by side magnify.
+    """
+    w, camera = view.inverse_depth, view.camera
+    height, width = w.shape
+    reach = max(1, round(_PLANE_SHARE * width))
+    side, known = 2 * reach + 1, (~view.broken).astype(np.float64)
+
+    def sums(values: F64) -> F64:
+        filtered = cv2.boxFilter(
+            values * known, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT
+        )
+        return np.asarray(filtered, np.float64)
+
+    u = np.tile(np.arange(width) - 0.5 * width, (height, 1))
+    v = np.tile(np.arange(height)[:, None] - 0.5 * height, (1, width))
+    count = sums(np.ones_like(w))
+    n = np.maximum(count, 1.0)
+    mean_u, mean_v, mean_w = sums(u) / n, sums(v) / n, sums(w) / n
+    uu, uv, vv = (sums(a * b) / n for a, b in ((u, u), (u, v), (v, v)))
+    uu, uv, vv = uu - mean_u * mean_u, uv - mean_u * mean_v, vv - mean_v * mean_v
+    uw, vw = sums(u * w) / n - mean_u * mean_w, sums(v * w) / n - mean_v * mean_w
+    determinant = uu * vv - uv * uv
+    defined = ~view.broken & (count >= _PLANE_KNOWN * side * side) & (determinant > 0.0)
+    determinant = np.where(defined, determinant, 1.0)
+    across, down = (uw * vv - vw * uv) / determinant, (vw * uu - uw * uv) / determinant
+    here = mean_w + across * (u - mean_u) + down * (v - mean_v)
+    x = (np.arange(width) - camera.cx) / camera.fx
+    y = (np.arange(height) - camera.cy) / camera.fy
+    normals = np.stack([across * camera.fx, down * camera.fy, np.zeros_like(w)], axis=-1)
+    normals[..., 2] = here - normals[..., 0] * x - normals[..., 1] * y[:, None]
     return -_unit(normals), defined

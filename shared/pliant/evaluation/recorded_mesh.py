@@ -22,7 +22,7 @@ from pliant.pictures.caption import with_caption
 from pliant.pictures.mesh import draw_mesh, mesh_view
 from pliant.pictures.movie import write_image
 from pliant.results.folder import MESH_ERROR_NAME, RECORDING_NAME
-from pliant.results.mesh_files import read_mesh
+from pliant.results.mesh_files import read_mesh, run_of
 from pliant.results.run import Run, read_run
 from pliant.yaml_text import load_yaml
 
@@ -34,10 +34,13 @@ MESHES = {"mesh": "mesh.ply", "mesh_coarse": "mesh_coarse.ply"}
 def mesh_against_truth(
     result: Path, truth: Path, evaluation: Evaluation, figures: dict[str, Any]
 ) -> Iterator[str]:
-    """Both meshes of a result.  Raises ResultError where there is none, or no true depth."""
+    """Both meshes of a run, or of a folder of ``pliant mesh``.
+
+    Raises ResultError where there is none, or no true depth.
+    """
     if not (result / MESHES["mesh"]).exists():
         raise ResultError(f"{result}: no mesh.ply: run with a mesh, or `pliant mesh {result}`")
-    run = read_run(result / RECORDING_NAME)
+    run = read_run(run_of(result) / RECORDING_NAME)
     if run.stream is None:
         raise ResultError(f"{result}: the recording has no camera")
     for key, name in MESHES.items():

@@ -1,5 +1,7 @@
 """The meshes of a recording as the files that a user opens."""
 
+import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,12 +10,16 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
+from pliant.errors import ResultError
 from pliant.formats.ply import read_ply, write_ply
 from pliant.messages.mesh_pieces import joined
 from pliant.messages.types import MeshPiece
 from pliant.pictures.mesh import draw_mesh, mesh_view
 from pliant.pictures.movie import write_image
 
+MESHED_NAME = "mesh.json"
+"""Report of ``pliant mesh``, in a folder of its own."""
+_RECORDING = "recording"
 _NAMES = {"fine": "mesh", "coarse": "mesh_coarse"}
 
 
@@ -74,6 +80,28 @@ def write_pictures(folder: Path, mesh: TriangleMesh, T_world_camera: F64, suffix
     write_image(folder / f"mesh{suffix}.png", pictures.colours)
     write_image(folder / f"mesh_shaded{suffix}.png", pictures.shaded)
     write_image(folder / f"mesh_normals{suffix}.png", pictures.normals)
+
+
+def place_of(recording: Path, folder: Path) -> dict[str, str]:
+    """The entry of MESHED_NAME for the recording that was meshed: relative to the folder."""
+    return {_RECORDING: os.path.relpath(recording.resolve(), folder.resolve())}
+
+
+def run_of(folder: Path) -> Path:
+    """The result folder of the run: that of a folder of ``pliant mesh``, else the folder itself.
+
+    Raises ResultError where the report does not name a recording that is there.
+    """
+    report = folder / MESHED_NAME
+    if not report.is_file():
+        return folder
+    try:
+        recording = folder.resolve() / json.loads(report.read_text(encoding="utf-8"))[_RECORDING]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ResultError(f"{report}: names no recording ({error!r}): mesh it again") from None
+    if not recording.exists():
+        raise ResultError(f"{report}: its recording {recording} is gone: mesh it again")
+    return recording.parent
 
 
 def mesh_report(pieces: Sequence[MeshPiece]) -> list[dict[str, Any]]:
