@@ -256,7 +256,7 @@ def _plane_normals(view: DepthView) -> tuple[F64, BoolArray]:
     """
     w, camera = view.inverse_depth, view.camera
     height, width = w.shape
-    reach = max(1, round(_PLANE_SHARE * width))
+    reach = max(2, round(_PLANE_SHARE * width))
     side, known = 2 * reach + 1, (~view.broken).astype(np.float64)
 
     def sums(values: F64) -> F64:
