@@ -5,13 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pliant.algorithms.arrays import F32, F64, I32, BoolArray
+from pliant.algorithms.arrays import F32, F64, I32, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.meshing import tsdf_volume
+from pliant.algorithms.meshing.marching_cubes import Tsdf
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.algorithms.meshing.mesh_borders import smoothed_borders, without_teeth, zipped
 from pliant.algorithms.meshing.mesh_finish import peeled
 from pliant.algorithms.meshing.mesh_topology import NONE, border_of, split_fans
 from pliant.algorithms.meshing.parameters import TsdfParameters
+from pliant.algorithms.meshing.tsdf_blocks import InMemory
+from pliant.algorithms.meshing.tsdf_closing import Evidence, evidence_of
 from pliant.algorithms.meshing.tsdf_volume import TsdfVolume
 from pliant.formats.ply import read_ply, write_ply
 from pliant.messages.mesh_pieces import joined, split
@@ -209,6 +213,28 @@ def test_a_crumb_goes() -> None:
     volume = wall(hole, crumb=True)
     assert volume.extract_all().positions[:, 2].min() < 0.62 * DEPTH
     assert volume.extract_finished().positions[:, 2].min() > 0.7 * DEPTH
+
+
+def test_what_vertices_read_of_the_voxels_on_disk_is_let_go_part_by_part(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    whole = wall(patch(6)).extract_finished()
+    done: list[int] = []
+
+    def watched(positions: F32, tsdf: Tsdf, filled: U8) -> Evidence:
+        done.append(len(positions))
+        return evidence_of(positions, tsdf, filled)
+
+    monkeypatch.setattr(tsdf_volume, "_VERTICES_AT_ONCE", 300)
+    monkeypatch.setattr(tsdf_volume, "evidence_of", watched)
+    monkeypatch.setattr(InMemory, "let_go", lambda _: done.append(0))
+    again = wall(patch(6)).extract_finished()
+    first = next(at for at, count in enumerate(done) if count)
+    assert len(done[first:]) > 6
+    assert max(done) == 300
+    assert not any(done[first + 1 :: 2])  # after each part
+    for name in ("positions", "normals", "colours", "triangles", "closed"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(whole, name))
 
 
 def test_an_empty_volume_gives_an_empty_mesh() -> None:

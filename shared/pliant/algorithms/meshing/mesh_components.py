@@ -1,6 +1,7 @@
 """Connected components: of a graph, and a mesh without those that are small."""
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -19,12 +20,9 @@ def cleaned(mesh: TriangleMesh) -> TriangleMesh:
     """
     if not len(mesh.triangles):
         return mesh
-    triangles = mesh.triangles.astype(np.int64)
-    label = components(len(mesh.positions), triangles[:, :2].ravel(), triangles[:, 1:].ravel())[
-        triangles[:, 0]
-    ]
-    areas = np.bincount(label, areas_of(mesh.positions, mesh.triangles))
-    return mesh.of_triangles((areas >= CRUMB * areas.max())[label])
+    piece = pieces_of(len(mesh.positions), mesh.triangles)
+    areas = np.bincount(piece, areas_of(mesh.positions, mesh.triangles))
+    return mesh.of_triangles((areas >= CRUMB * areas.max())[piece])
 
 
 @kernel
@@ -44,6 +42,23 @@ def areas_of(positions: F32, triangles: I32) -> F64:
     return areas
 
 
+@kernel
+def pieces_of(count: int, triangles: I32) -> I32:
+    """(T,) the connected component of each triangle, named by one of its ``count`` vertices.
+
+    A kernel, because numpy takes 80 bytes a triangle.
+    """
+    parent = np.arange(count).astype(np.int32)
+    for t in range(len(triangles)):
+        _join(parent, triangles[t, 0], triangles[t, 1])
+        _join(parent, triangles[t, 1], triangles[t, 2])
+    _flatten(parent)
+    pieces = np.empty(len(triangles), np.int32)
+    for t in range(len(triangles)):
+        pieces[t] = parent[triangles[t, 0]]
+    return pieces
+
+
 def components(count: int, here: I64, there: I64) -> I64:
     """(count,) the connected component of each node of a graph, numbered by their first nodes."""
     _, component = np.unique(_roots(count, here, there), return_inverse=True)
@@ -55,17 +70,27 @@ def _roots(count: int, here: I64, there: I64) -> I64:
     """The least node that each is joined to, by halving the paths of a disjoint set."""
     parent = np.arange(count)
     for edge in range(len(here)):
-        one, other = here[edge], there[edge]
-        while parent[one] != one:
-            parent[one] = parent[parent[one]]
-            one = parent[one]
-        while parent[other] != other:
-            parent[other] = parent[parent[other]]
-            other = parent[other]
-        if one < other:
-            parent[other] = one
-        else:
-            parent[one] = other
-    for node in range(count):
-        parent[node] = parent[parent[node]]
+        _join(parent, here[edge], there[edge])
+    _flatten(parent)
     return parent
+
+
+@kernel
+def _join(parent: Any, one: Any, other: Any) -> None:
+    while parent[one] != one:
+        parent[one] = parent[parent[one]]
+        one = parent[one]
+    while parent[other] != other:
+        parent[other] = parent[parent[other]]
+        other = parent[other]
+    if one < other:
+        parent[other] = one
+    else:
+        parent[one] = other
+
+
+@kernel
+def _flatten(parent: Any) -> None:
+    """Parents are never greater: those before a node are done."""
+    for node in range(len(parent)):
+        parent[node] = parent[parent[node]]

@@ -6,14 +6,15 @@ ends where the observations do.  Components of little area and weight are remove
 voxels, a share of the scene's median depth.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, I32, BoolArray
+from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.algorithms.meshing.mesh_borders import smoothed_borders, without_teeth, zipped
-from pliant.algorithms.meshing.mesh_components import areas_of, components
+from pliant.algorithms.meshing.mesh_components import areas_of, pieces_of
 from pliant.algorithms.meshing.mesh_topology import NONE, corner_before, split_fans, stars_of
 from pliant.algorithms.meshing.tsdf_closing import CARRIED, Evidence, is_guessed
 from pliant.compiler.kernel import kernel
@@ -46,8 +47,14 @@ class _Judged:
 
     def kept(self, alive: BoolArray) -> "_Judged":
         """Select triangles (T,)."""
-        used = np.unique(self.mesh.triangles[alive])
-        mesh = self.mesh.of_triangles(alive)
+        mesh = self.mesh
+        used, triangles = _of_used_vertices(len(mesh.positions), mesh.triangles, alive)
+        mesh = TriangleMesh(
+            positions=mesh.positions[used],
+            normals=mesh.normals[used],
+            colours=mesh.colours[used],
+            triangles=triangles,
+        )
         return _Judged(mesh, self.support[used], self.guessed[used])
 
     def zipped(self, max_edge: float) -> "_Judged":
@@ -65,13 +72,17 @@ class _Judged:
         return _Judged(mesh, self.support[was], self.guessed[was])
 
 
-def finished(mesh: TriangleMesh, evidence: Evidence, voxel: float) -> TriangleMesh:
+def finished(
+    mesh: TriangleMesh, evidence_of: Callable[[F32], Evidence], voxel: float
+) -> TriangleMesh:
     """Return the finished mesh of a volume with extrapolated distances, with its guesses marked.
 
-    voxel: its side, in the unit of the mesh.
+    evidence_of: for vertices (V, 3).    voxel: its side, in the unit of the mesh.
     """
+    evidence = evidence_of(mesh.positions)
     judged = _Judged(mesh, evidence.support, is_guessed(evidence, _SURE_STEPS))
-    judged = judged.kept(peeled(mesh.triangles, judged.guessed, _RINGS))
+    del mesh, evidence  # each step takes the place of the one before
+    judged = judged.kept(peeled(judged.mesh.triangles, judged.guessed, _RINGS))
     judged = judged.zipped(_MAX_EDGE * voxel)
     judged = judged.kept(without_teeth(judged.mesh.positions, judged.mesh.triangles))
     judged = judged.kept(_large_enough(judged, voxel))
@@ -86,14 +97,46 @@ def finished(mesh: TriangleMesh, evidence: Evidence, voxel: float) -> TriangleMe
 
 def _large_enough(judged: _Judged, voxel: float) -> BoolArray:
     """(T,) triangles of components with sufficient area times weight, which is at most 1."""
-    triangles = judged.mesh.triangles.astype(np.int64)
-    if not len(triangles):
-        return np.zeros(0, np.bool_)
-    count = len(judged.mesh.positions)
-    piece = components(count, triangles[:, :2].ravel(), triangles[:, 1:].ravel())[triangles[:, 0]]
-    certain = np.minimum(judged.support[triangles].mean(axis=1, dtype=np.float64), 1.0)
-    sizes = np.bincount(piece, areas_of(judged.mesh.positions, judged.mesh.triangles) * certain)
+    mesh = judged.mesh
+    piece = pieces_of(len(mesh.positions), mesh.triangles)
+    areas = areas_of(mesh.positions, mesh.triangles)
+    sizes = _certain_areas(piece, areas, mesh.triangles, judged.support)
     return (sizes >= _CRUMB * voxel * voxel)[piece]
+
+
+@kernel
+def _of_used_vertices(count: int, triangles: I32, alive: BoolArray) -> tuple[I64, I32]:
+    """The vertices that kept triangles use, and these.  A kernel, because numpy takes 120 bytes a
+    triangle."""
+    place, kept = np.full(count, NONE, np.int32), 0
+    for t in range(len(triangles)):
+        if alive[t]:
+            kept += 1
+            for k in range(3):
+                place[triangles[t, k]] = 0
+    used = np.flatnonzero(place != NONE)
+    for row in range(len(used)):
+        place[used[row]] = row
+    some = np.empty((kept, 3), np.int32)
+    row = 0
+    for t in range(len(triangles)):
+        if alive[t]:
+            for k in range(3):
+                some[row, k] = place[triangles[t, k]]
+            row += 1
+    return used, some
+
+
+@kernel
+def _certain_areas(piece: I32, areas: F64, triangles: I32, support: F32) -> F64:
+    """(V,) area times weight of the component that a vertex names."""
+    sizes = np.zeros(len(support))
+    for t in range(len(triangles)):
+        total = 0.0
+        for k in range(3):
+            total += support[triangles[t, k]]
+        sizes[piece[t]] += areas[t] * min(total / 3.0, 1.0)
+    return sizes
 
 
 @kernel

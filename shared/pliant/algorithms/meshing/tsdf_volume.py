@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from pliant.algorithms.meshing.tsdf_blocks import (
     find_rows,
     with_neighbours,
 )
-from pliant.algorithms.meshing.tsdf_closing import CARRIED, carry_on, evidence_of
+from pliant.algorithms.meshing.tsdf_closing import CARRIED, Evidence, carry_on, evidence_of
 from pliant.algorithms.meshing.tsdf_integrate import (
     WEIGHT_UNITS,
     PixelPlanes,
@@ -40,6 +41,8 @@ from pliant.algorithms.meshing.tsdf_integrate import (
 
 _AT_ONCE = 4096
 """Blocks that are meshed while they and their neighbours, some 100 MB, are in memory."""
+_VERTICES_AT_ONCE = 2**18
+"""Whose evidence is looked up at once: they are in the order of the blocks."""
 
 
 class VolumeFullError(Exception):
@@ -145,10 +148,20 @@ class TsdfVolume:
         for step in range(1, CARRIED + 1):
             for keys in self._parts(self.keys):
                 carry_on(keys, tsdf, step, steps)
-        mesh = self.extract_all(MOST_STEPS)
-        evidence = evidence_of(mesh.positions, tsdf, steps)
-        self._blocks.where.let_go()
-        return finished(mesh, evidence, self.scale.voxel)
+        # No name for the mesh: the first step of finishing is to let go of it.
+        evidence = partial(self._evidence, tsdf, steps)
+        return finished(self.extract_all(MOST_STEPS), evidence, self.scale.voxel)
+
+    def _evidence(self, tsdf: Tsdf, steps: U8, positions: F32) -> Evidence:
+        """As ``evidence_of``, of some vertices after the others."""
+        count = len(positions)
+        every = Evidence(np.zeros(count, np.float32), np.zeros(count, np.float32))
+        for first in range(0, count, _VERTICES_AT_ONCE):
+            rows = slice(first, first + _VERTICES_AT_ONCE)
+            some = evidence_of(positions[rows], tsdf, steps)
+            every.support[rows], every.steps[rows] = some
+            self._blocks.where.let_go()
+        return every
 
     def _tsdf(self, max_steps: float) -> Tsdf:
         min_weight = max(1, round(self._parameters.min_weight * WEIGHT_UNITS))
