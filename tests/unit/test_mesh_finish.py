@@ -227,7 +227,11 @@ def test_what_vertices_read_of_the_voxels_on_disk_is_let_go_part_by_part(
 
     monkeypatch.setattr(tsdf_volume, "_VERTICES_AT_ONCE", 300)
     monkeypatch.setattr(tsdf_volume, "evidence_of", watched)
-    monkeypatch.setattr(InMemory, "let_go", lambda _: done.append(0))
+
+    def let_go(_: InMemory) -> None:
+        done.append(0)
+
+    monkeypatch.setattr(InMemory, "let_go", let_go)
     again = wall(patch(6)).extract_finished()
     first = next(at for at, count in enumerate(done) if count)
     assert len(done[first:]) > 6
