@@ -19,7 +19,6 @@ from pliant.algorithms.slam.active.frame_pose import (
     judge_tracks,
     locate_in_map,
     reacquire_points,
-    to_global_shutter,
     with_support,
 )
 from pliant.algorithms.slam.active.tracked_pose import pose_by_tracks
@@ -181,9 +180,7 @@ class Localiser(FrameMapper):
 
     def _find(self, active: ActiveMap, frame: IdealFrame, T_world_camera: F64) -> PlacedFrame:
         """The pose by all reacquired landmarks, and its quality."""
-        if self._motion is not None:
-            frame = to_global_shutter(active, self._motion, frame, T_world_camera)
-        placed = reacquire_points(active, frame, T_world_camera)
+        placed = reacquire_points(active, self._motion, frame, T_world_camera)
         interval_s = 0.0 if self._motion is None else self._motion.interval_s()
         settled = frame.tracks.ages * interval_s >= self._parameters.support.settled_s
         placed = with_support(active, placed, frame.tracks.points_px[settled])

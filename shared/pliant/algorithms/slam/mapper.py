@@ -22,7 +22,6 @@ from pliant.algorithms.slam.active.frame_pose import (
     limits_of_points,
     locate_in_map,
     reacquire_points,
-    to_global_shutter,
     tracks_to_points,
 )
 from pliant.algorithms.slam.active.frame_turns import FrameTurns
@@ -119,7 +118,9 @@ class Mapper:
             return self._wait(ideal, timer)
         if located is None:
             return self._lost(active, ideal)
-        placed = self._reacquire(active, ideal, located, timer)
+        with timer("reacquisition"):
+            placed = reacquire_points(active, self._motion, ideal, located)
+            self._turns.look(active, self._motion, placed)
         placed = self._adjust(active, placed, timer)
         placed = self._attach(active, placed, timer)
         self._refine_passed(active.segment, timer)
@@ -145,17 +146,6 @@ class Mapper:
         active.links.follow(frame.extrema.ids, active.points)
         self.atlas.focus(self._motion, frame.stamp_ns, frame.extrema)
         self._motion = self._turns.predict(self._motion, frame.stamp_ns)
-
-    def _reacquire(
-        self, active: ActiveMap, frame: IdealFrame, located: F64, timer: StageTimer
-    ) -> PlacedFrame:
-        """Find landmarks that have lost their tracks."""
-        with timer("reacquisition"):
-            frame = to_global_shutter(active, self._motion, frame, located)
-            prior = self._motion.prior(self._camera)
-            placed = reacquire_points(active, frame, located, prior)
-            self._turns.look(active, self._motion, placed)
-        return placed
 
     def _adjust(self, active: ActiveMap, placed: PlacedFrame, timer: StageTimer) -> PlacedFrame:
         """Adjust the frame with its landmarks, and triangulate others."""

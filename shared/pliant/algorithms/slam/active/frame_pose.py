@@ -191,10 +191,16 @@ def to_global_shutter(
 
 
 def reacquire_points(
-    active: ActiveMap, frame: IdealFrame, T_world_camera: F64, prior: PosePrior = NO_PRIOR
+    active: ActiveMap, motion: Motion | None, frame: IdealFrame, T_world_camera: F64
 ) -> PlacedFrame:
-    """Find landmarks without a track among the maxima, and refine the pose with them."""
-    prior = prior.unless_contradicted(T_world_camera)
+    """Find landmarks without a track among the maxima, and refine the pose with them.
+
+    motion: before the frame, which it converts to a global shutter.
+    """
+    prior = NO_PRIOR
+    if motion is not None:
+        frame = to_global_shutter(active, motion, frame, T_world_camera)
+        prior = motion.prior(active.camera).unless_contradicted(T_world_camera)
     placed = PlacedFrame(frame=frame, T_world_camera=T_world_camera, prior=prior)
     points, parameters, tracks = active.points, active.parameters, frame.tracks
     reacquired = reacquire(
