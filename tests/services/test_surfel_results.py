@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import pliant
 from pliant.algorithms.surfels.surface import surface_of
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import config_yaml, load_config
@@ -102,6 +103,46 @@ def test_tracks_are_the_tracked_surfels_of_the_recording(recorded: Path, tmp_pat
     every = export_result(recorded, "tracks", tmp_path / "every", every=2)
     with np.load(every / "tracks.npz") as found:
         assert found["frames"].tolist() == [0, 2, 4]
+
+
+def test_strain_is_exported_for_each_triangle_of_the_surface(
+    recorded: Path, tmp_path: Path
+) -> None:
+    path = export_result(recorded, "strain", tmp_path / "strain", every=2)
+    assert [each.name for each in path.iterdir()] == ["strain.npz"]  # it has no images
+    frames = list(recorded_surfels(recorded / RECORDING_NAME))[::2]
+    with np.load(path / "strain.npz") as found:
+        strain, triangles, positions = (
+            found[name] for name in ("strain", "triangles", "positions")
+        )
+        assert found["frames"].tolist() == [0, 2, 4]
+        assert found["stamps_ns"].tolist() == [frame.stamp_ns for frame in frames]
+    assert strain.shape == (3, len(triangles))
+    assert positions.shape == (3, triangles.max() + 1, 3)
+    for n, frame in enumerate(frames):
+        assert np.isfinite(strain[n]).sum() == len(surface_of(frame)[2]) > 40
+    stays = np.isfinite(strain).all(axis=0)
+    assert (strain[0, stays] == 0.0).all()
+    lengths = [
+        np.linalg.norm(np.diff(positions[n][triangles[stays]], axis=1), axis=2) for n in (0, 2)
+    ]
+    assert np.abs(strain[2, stays]).max() < 2.0 * np.abs(lengths[1] / lengths[0] - 1.0).max() + 0.05
+
+
+def test_python_has_the_surface_of_a_frame(recorded: Path) -> None:
+    result = pliant.open(recorded)
+    surface = result.surface(3)
+    frame = list(result.surfels())[3]
+    rows, _, triangles = surface_of(frame)
+    np.testing.assert_array_equal(surface.ids, frame.ids[rows])
+    np.testing.assert_allclose(surface.positions, frame.positions[rows], rtol=1e-6)
+    assert len(surface.triangles) == len(triangles)
+    assert (surface.colours == 128).all()
+    corners = surface.positions[surface.triangles]
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert ((facing * (frame.T_world_camera[:3, 3] - corners[:, 0])).sum(axis=1) > 0.0).all()
+    with pytest.raises(ResultError, match="frame 99"):
+        result.surface(99)
 
 
 def test_an_animation_has_the_surfels_of_each_key_frame_in_their_places(

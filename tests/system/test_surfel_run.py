@@ -57,8 +57,10 @@ def test_the_page_shows_the_surface(result: Path) -> None:
     (told,) = re.findall(r'id="scene">(.*?)</script>', page, re.DOTALL)
     layers = {layer["name"]: layer for layer in json.loads(told)["layers"]}
     assert 0 < layers["points"]["count"] <= 60
-    assert layers["mesh"]["count"] >= 2 * layers["points"]["count"]  # from both sides
-    assert layers["mesh"]["triangles"] > layers["points"]["count"]
+    keys = layers["mesh"]["keys"]
+    assert [key["name"] for key in keys] == [f"frame {n}" for n in range(FRAMES)]
+    assert layers["mesh"]["count"] == keys[-1]["vertices"][1]
+    assert keys[-1]["triangles"][1] - keys[-1]["triangles"][0] > layers["points"]["count"]
     assert layers["path"]["count"] == FRAMES
     assert f"{FRAMES}, {FRAMES} tracked" in page
     assert '<span class="verdict good">good</span>' in page
@@ -75,6 +77,7 @@ def test_surfels_are_drawn_in_both_viewers(result: Path, tmp_path: Path) -> None
     if command.is_file():
         done = subprocess.run([command, "rrd", "print", path], capture_output=True, text=True)
         assert "/map/world/surfels" in done.stdout
+        assert "/map/world/surface" in done.stdout
         assert "/map/camera/image/surfels" in done.stdout
     path = export_result(result, "foxglove", tmp_path / "run.mcap")
     counts: dict[str, int] = {}
@@ -84,7 +87,7 @@ def test_surfels_are_drawn_in_both_viewers(result: Path, tmp_path: Path) -> None
             counts[channel.topic] = counts.get(channel.topic, 0) + 1
             if channel.topic == "/surfels/quads":
                 last = scene_update.SceneUpdate.FromString(message.data)
-    for topic in ("/surfels/quads", "/surfels/points", "/surfels/image", "/tf"):
+    for topic in (*(f"/surfels/{name}" for name in ("quads", "points", "image", "mesh")), "/tf"):
         assert counts[topic] == FRAMES
     with np.load(result / "surfels.npz") as surfels:
         centres = surfels["positions"][-surfels["counts"][-1] :]

@@ -400,14 +400,3 @@ def test_a_step_turns_by_its_rotation_vector(angle: float) -> None:
     R = so3_exp(angle * axis)
     np.testing.assert_allclose(out[motion.A : motion.A + 3], R[:, 0], atol=1e-14)
     np.testing.assert_allclose(out[motion.B : motion.B + 3], R[:, 1], atol=1e-14)
-
-
-def test_a_step_of_many_turns_keeps_lengths() -> None:
-    """As of a surfel that only torn pairs hold."""
-    pose = slanted_surfels()[0]
-    step, out = np.zeros(motion.MOST_PARAMETERS), np.zeros_like(pose)
-    step[3:6] = 1e6, -1e5, 3e5
-    motion.apply_step(pose, step, motion.GENERAL, out)
-    for tangent in (motion.A, motion.B):
-        before, after = (np.linalg.norm(each[tangent : tangent + 3]) for each in (pose, out))
-        assert after == pytest.approx(before, rel=1e-12)

@@ -1,6 +1,7 @@
 """Neighbouring surfels that hold on to each other."""
 
 import numpy as np
+import pytest
 from surfel_scene import slanted_surfels
 
 from pliant.algorithms.arrays import F64
@@ -15,7 +16,7 @@ from pliant.algorithms.surfels.deformation_graph import (
     no_edges,
     torn_off,
 )
-from pliant.algorithms.surfels.graph_alignment import Springs, solve_graph
+from pliant.algorithms.surfels.graph_alignment import Springs, bound_turns, solve_graph
 from pliant.algorithms.surfels.patch_sampling import A, B, F, X
 
 N = 12
@@ -100,6 +101,21 @@ def test_the_median_strain_is_that_of_plain_numpy() -> None:
     more, known = np.concatenate([poses, poses[:1]]), np.ones(N + 1, np.bool_)
     assert np.isnan(median_strains(more, edges, known)).tolist() == [False] * N + [True]
     assert np.isnan(median_strains(poses, no_edges(), known[:N])).all()
+
+
+def test_steps_turn_by_half_a_turn_at_most() -> None:
+    """As of a surfel that only torn pairs carry: its tangents keep their lengths."""
+    x = np.array([(1.0, 2.0, 3.0, 1e6, -1e5, 3e5), (4.0, 5.0, 6.0, 0.1, -3.0, 0.2)])
+    before = slanted_surfels()
+    bounded = x.copy()
+    bound_turns(bounded)
+    np.testing.assert_array_equal(bounded[1], x[1])
+    np.testing.assert_array_equal(bounded[0, :3], x[0, :3])
+    np.testing.assert_allclose(np.cross(bounded[0, 3:], x[0, 3:]), 0.0, atol=1e-6)
+    after = stepped(before, bounded[:1])
+    for tangent in (A, B):
+        lengths = [np.linalg.norm(pose[0, tangent : tangent + 3]) for pose in (before, after)]
+        assert lengths[1] == pytest.approx(lengths[0], rel=1e-12)
 
 
 def test_a_rigid_motion_costs_nothing() -> None:

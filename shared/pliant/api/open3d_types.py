@@ -1,10 +1,11 @@
 """Points and meshes as numpy has them, which Open3D takes, too."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, U8
+from pliant.algorithms.arrays import F64, I64, U8
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.open3d_geometry import to_cloud, to_mesh
 
@@ -43,3 +44,10 @@ class Mesh(TriangleMesh):
     def to_open3d(self) -> Any:
         """``open3d.geometry.TriangleMesh``.  Raises Open3dError where it cannot be loaded."""
         return to_mesh(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface(Mesh):
+    """The mesh between the tracked surfels of a frame.  ids: (V,) of the surfel at each vertex."""
+
+    ids: I64

@@ -16,13 +16,15 @@ from pliant.algorithms.arrays import F32, F64, I64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.slam.calibration.corrected_view import corrected_view
+from pliant.algorithms.surfels.surface import surface_of
 from pliant.api.mapped import Mapped
-from pliant.api.open3d_types import Mesh
+from pliant.api.open3d_types import Mesh, Surface
 from pliant.datasets.calibration import Calibration, calibration_from_yaml
 from pliant.datasets.own_recording import recorded_frame
 from pliant.datasets.recorded_images import RecordedImages
 from pliant.datasets.rectifier import Rectifier
 from pliant.errors import ResultError
+from pliant.export.surface_meshes import colours_at
 from pliant.map_history import MapHistory
 from pliant.messages import topics
 from pliant.messages.topics import Topic
@@ -38,6 +40,8 @@ from pliant.results.run import Run, read_run, seen_by_keyframes
 from pliant.results.surfels import has_surfels, recorded_surfels, surfel_report, surfel_trajectory
 from pliant.results.verdict import summary
 from pliant.trajectory import Trajectory
+
+_GREY = 128
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,6 +171,28 @@ class Result(Mapped):
     def surfels(self) -> Iterator[Surfels]:
         """The surfels of a deforming scene, in every frame."""
         return recorded_surfels(self._recording.path)
+
+    def surface(self, frame: int) -> Surface:
+        """Of a scene that deforms: the mesh between its tracked surfels in a frame, in the world of
+        its segment.  It is grey where no image was recorded.
+
+        Raises ResultError where the frame was not recorded, or has no surfels.
+        """
+        surfels = self._message(topics.SURFELS, frame)
+        assert isinstance(surfels, Surfels)
+        if surfels.missing:
+            raise ResultError(f"{self.path}: frame {frame} has no surfels: {surfels.missing}")
+        rows, normals, triangles = surface_of(surfels)
+        colours = np.full((len(rows), 3), _GREY, np.uint8)
+        if next(self._recording.messages(topics.SOURCE), None) is not None:
+            colours = colours_at(self.image(frame), surfels.points_px[rows])
+        return Surface(
+            positions=surfels.positions[rows].astype(np.float32),
+            normals=normals,
+            colours=colours,
+            triangles=np.ascontiguousarray(triangles[:, ::-1]),  # seen from the camera
+            ids=surfels.ids[rows],
+        )
 
     def picture(self, width: int = 960, height: int = 720) -> U8:
         """(height, width, 3) RGB of the points, the camera's path, and lines between keyframes that

@@ -28,16 +28,7 @@ def animation(
 
     Raises ResultError for a recording without surfels, and where fewer than two key frames remain.
     """
-    check_deformable(recording)
-    segment, frames = _longest_segment(recording)
-    every = every or max(1, -(-len(frames) // _KEYS))
-    chosen = frames[frames % every == 0]
-    if len(chosen) < 2:
-        raise ResultError(
-            f"{recording.path}: an animation needs two frames with tracked surfels, segment "
-            f"{segment} has {len(chosen)} of every {every}: use a smaller --every"
-        )
-    wanted = set(chosen.tolist())
+    segment, every, wanted = key_frames(recording, every)
     keys: list[Surfels] = []
     tints: dict[int, U8] = {}
     for surfels, pixels in surfels_with_images(recording, lambda s: s.frame in wanted):
@@ -52,6 +43,23 @@ def animation(
     mesh = animated(surface, keys, tints)
     unit = "metres" if is_metric(recording.metadata()) else "units of the depth at the start"
     write_animated_glb(path, mesh, {"unit": unit, "segment": segment, "key_frames_every": every})
+
+
+def key_frames(recording: Recording, every: int | None) -> tuple[int, int, set[int]]:
+    """Longest segment, N, and every Nth frame of it.  every: N, by default for at most 60 frames.
+
+    Raises ResultError for a recording without surfels, and where fewer than two key frames remain.
+    """
+    check_deformable(recording)
+    segment, frames = _longest_segment(recording)
+    every = every or max(1, -(-len(frames) // _KEYS))
+    chosen = frames[frames % every == 0]
+    if len(chosen) < 2:
+        raise ResultError(
+            f"{recording.path}: needs two frames with tracked surfels, segment "
+            f"{segment} has {len(chosen)} of every {every}: use a smaller --every"
+        )
+    return segment, every, set(chosen.tolist())
 
 
 def animated(

@@ -30,6 +30,7 @@ from pliant.export.overview import (
     still_picture,
 )
 from pliant.export.splat import splat
+from pliant.export.strain_maps import strain_maps
 from pliant.export.surface_meshes import overlay_pictures, surfaces
 from pliant.export.surfel_tracks import surfel_tracks
 from pliant.export.textured import glb, obj
@@ -322,6 +323,7 @@ _WRITERS: dict[str, Export] = {
     "surface": surfaces,
     "animation": animation,
     "tracks": surfel_tracks,
+    "strain": strain_maps,
     "overlay": _overlay,
     "picture": _picture,
     "overview": _overview,

@@ -20,6 +20,7 @@ KINDS = {
     "surface": "surface",
     "animation": "animation.glb",
     "tracks": "tracks",
+    "strain": "strain",
     "overlay": "overlay.webm",
     "picture": "picture.png",
     "overview": "overview.webp",
@@ -42,7 +43,7 @@ OF_STILL_SCENES = (
 )
 """Kinds that are made of a map or mesh, which a run of the deformable profile has not."""
 OPTIONS = {
-    "every": ("surface", "animation", "tracks"),
+    "every": ("surface", "animation", "tracks", "strain"),
     "triangles": ("glb", "obj"),
     "clean": ("glb", "obj"),
     "observed": ("glb", "obj"),

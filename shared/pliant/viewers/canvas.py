@@ -73,6 +73,10 @@ class Canvas(Protocol):
         """All surfels, in the world and on the image, in place of those before."""
         ...
 
+    def surface(self, at: Moment, segment: int, mesh: TriangleMesh) -> None:
+        """The mesh between surfels, seen from both sides, in place of that before."""
+        ...
+
     def forget(self, at: Moment, segment: int) -> None:
         """A world has ended: the map was lost and another one has begun."""
         ...

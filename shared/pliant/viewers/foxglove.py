@@ -7,7 +7,7 @@
     /map/places      lines between keyframes that show one place
     /map/mesh        surface: the live mesh as it grew, then the final one in its place
     /map/all_points  the whole map, once, at the end of a segment
-    /surfels/quads, /surfels/points, /surfels/image   every frame of the deformable profile
+    /surfels/quads, .../points, .../image, .../mesh   every frame of the deformable profile
 
 Stamps are capture times: a recording gives the same bytes each time.  Poses and points are as they
 were known at the time.  Needs its definitions: ``pip install 'pliant[foxglove]'``.
@@ -185,13 +185,19 @@ class FoxgloveFile:
                 group.outline_colors.append(self._colour(*rgb))
         self._write("/surfels/image", at, annotations, stamped=False)
 
+    def surface(self, at: Moment, segment: int, mesh: TriangleMesh) -> None:
+        """One entity."""
+        update, entity = self._entity(at, segment, "surface")
+        _add_triangles(entity, mesh)
+        self._write("/surfels/mesh", at, update, stamped=False)
+
     def forget(self, at: Moment, segment: int) -> None:
         """Take the lines and the mesh of a segment away."""
         update = self._kind("SceneUpdate")()
         deletion = update.deletions.add(type=_ALL_ENTITIES)
         deletion.timestamp.FromNanoseconds(at.stamp_ns)
         self._parts.clear()
-        for topic in ("/map/path", "/map/places", "/map/mesh", "/surfels/quads"):
+        for topic in ("/map/path", "/map/places", "/map/mesh", "/surfels/quads", "/surfels/mesh"):
             if topic in self._channels:
                 self._write(topic, at, update, stamped=False)
 

@@ -4,7 +4,7 @@
     map/world/points/N, path                    the map; each block by itself: little is sent
     map/world/places                            lines between keyframes that show one place
     map/world/mesh/live/X_Y_Z, mesh/final/N     the mesh, in groups of blocks while it grows
-    map/world/surfels                           small quads
+    map/world/surfels, .../surface              small quads, and the mesh between them
     curves/lag, milliseconds, rate, stages      how the services fare
     notes                                       lines for the user
 
@@ -229,6 +229,10 @@ class RerunCanvas:
             surfels.points_px + 0.5, colors=surfels.point_colours, radii=_SURFEL_RADIUS
         )
         self._log(at, f"{_IMAGE}/surfels", points)
+
+    def surface(self, at: Moment, segment: int, mesh: TriangleMesh) -> None:
+        """As one mesh."""
+        self._log_mesh(at, f"{_world(segment)}/surface", mesh, "DoubleSided")
 
     def forget(self, at: Moment, segment: int) -> None:
         """Clear a world."""

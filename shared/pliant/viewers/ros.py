@@ -136,6 +136,11 @@ class RosCanvas:
         """One marker."""
         self._tell("surfels", partial(marker, at, world_name(segment), "surfels", 0, surfels.quads))
 
+    def surface(self, at: Moment, segment: int, mesh: TriangleMesh) -> None:
+        """One more marker of the surfels."""
+        make = partial(marker, at, world_name(segment), "surface", 0, mesh)
+        self._tell("surfels", make)
+
     def forget(self, at: Moment, segment: int) -> None:
         """Take the mesh of a segment away."""
         self._kept.clear()

@@ -8,8 +8,6 @@ when det F = 1, that is alpha f22 - beta^2 = 1, hence f22 = (1 + beta^2) / alpha
 here: the printed entry has lost its square.
 """
 
-import math
-
 import numpy as np
 
 from pliant.algorithms.arrays import F64
@@ -189,17 +187,13 @@ def apply_step(pose: F64, step: F64, model: int, out: F64) -> None:
 
 @fast_kernel
 def _rotate(pose: F64, start: int, wx: float, wy: float, wz: float) -> None:
-    """Turn one tangent by a rotation vector (Rodrigues), by half a turn at most.
+    """Turn one tangent by a rotation vector (Rodrigues), of half a turn at most.
 
-    A surfel that is carried by torn pairs hardly knows its turn: beyond half a turn the series
-    would change lengths, and with every frame more.  sin a / a and (1 - cos a) / a^2 as series:
-    those of the C library differ in their last bits with what the processor can do.
+    sin a / a and (1 - cos a) / a^2 as series: those of the C library differ in their last bits
+    with what the processor can do.
     """
     x, y, z = pose[start], pose[start + 1], pose[start + 2]
     squared = wx * wx + wy * wy + wz * wz
-    if squared > math.pi * math.pi:
-        share = math.pi / math.sqrt(squared)
-        wx, wy, wz, squared = share * wx, share * wy, share * wz, math.pi * math.pi
     s, c = 1.0, 1.0
     for k in range(_TERMS, 0, -1):
         s = 1.0 - squared * s / (2 * k * (2 * k + 1))

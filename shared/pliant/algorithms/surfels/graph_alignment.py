@@ -334,10 +334,22 @@ def align_graph(
         solve_graph(damped, descent, springs, _CG_ITERATIONS, _CG_TOLERANCE, x)
         if not np.isfinite(x).all():
             break
+        bound_turns(x)
         _step(poses, x, own, seen, now, damping, travelled, matcher)
     torn = torn_off(edges, edge_rows(poses, edges)[0], n)
     poses[torn] = start[torn]
     return torn
+
+
+def bound_turns(x: F64) -> None:
+    """Bound the turns in steps (N, 6) by half a turn, as the series of ``apply_step`` needs it.
+
+    A surfel that only torn pairs carry hardly knows its turn.  Beyond half a turn the series would
+    change the lengths of its tangents, and more so with every frame.
+    """
+    turns = np.linalg.norm(x[:, 3:], axis=1)
+    rows = turns > np.pi
+    x[rows, 3:] *= (np.pi / turns[rows])[:, None]
 
 
 def _step(
