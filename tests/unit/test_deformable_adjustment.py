@@ -14,9 +14,9 @@ from pliant.algorithms.deformable.linearised import (
     times,
     times_transposed,
 )
+from pliant.algorithms.deformable.moving_landmarks import DeformingMap, TrackedPoints
 from pliant.algorithms.deformable.node_graph import no_nodes, node_graph
 from pliant.algorithms.deformable.priors import Prior
-from pliant.algorithms.deformable.moving_landmarks import DeformingMap, TrackedPoints
 from pliant.algorithms.deformable.track_choice import choose_tracks
 from pliant.algorithms.geometry import align_umeyama, so3_exp
 

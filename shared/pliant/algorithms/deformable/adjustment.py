@@ -45,9 +45,9 @@ from pliant.algorithms.deformable.linearised import (
     times,
     times_transposed,
 )
+from pliant.algorithms.deformable.moving_landmarks import DeformingMap, TrackedPoints
 from pliant.algorithms.deformable.node_graph import NodeGraph, no_nodes, node_graph
 from pliant.algorithms.deformable.priors import Prior
-from pliant.algorithms.deformable.moving_landmarks import DeformingMap, TrackedPoints
 from pliant.algorithms.geometry import so3_exp
 
 _NOISE_PX = 0.5
