@@ -147,8 +147,8 @@ def test_too_few_landmarks_are_refused() -> None:
 
 def problem(seed: int = 1) -> tuple[TrackedPoints, F64, F64, F64, I64, F64]:
     """Observations, poses, landmarks, displacements, carriers and weights near a solution."""
-    points, T = breathing(0.018)
-    points, T = points[:6, :60], T[:6]
+    points, T = (whole[:6] for whole in breathing(0.018))
+    points = points[:, :60]
     tracks = tracked(points, T, noise_px=1.0)
     rest = points.mean(axis=0)
     graph = node_graph(rest, 0.2)
@@ -205,13 +205,14 @@ def test_products_as_with_the_dense_matrix() -> None:
     k, i = tracks.keyframes, tracks.landmarks
     K, L, B = len(T), len(rest), CAMERA + 3 * d.shape[1]
     M = len(k)
-    J, Jx = np.zeros((M, 2, K, B)), np.zeros((M, 2, L, 3))
+    by_block, by_landmark = np.zeros((M, 2, K, B)), np.zeros((M, 2, L, 3))
     for m in range(M):
-        J[m, :, k[m], :CAMERA] = J_camera[m]
-        Jx[m, :, i[m]] = J_point[m]
+        by_block[m, :, k[m], :CAMERA] = J_camera[m]
+        by_landmark[m, :, i[m]] = J_point[m]
         for node, w in zip(carriers[i[m]], weights[i[m]], strict=True):
-            J[m, :, k[m], CAMERA + 3 * node : CAMERA + 3 * node + 3] += w * J_point[m]
-    J, Jx = J.reshape(2 * M, K * B), Jx.reshape(2 * M, 3 * L)
+            at = CAMERA + 3 * node
+            by_block[m, :, k[m], at : at + 3] += w * J_point[m]
+    J, Jx = by_block.reshape(2 * M, K * B), by_landmark.reshape(2 * M, 3 * L)
     H, g = np.zeros((K, B, B)), np.zeros((K, B))
     H_point, g_point = np.zeros((L, 3, 3)), np.zeros((L, 3))
     table = (k, i, carriers, weights, J_camera, J_point)

@@ -17,6 +17,8 @@ from pliant.algorithms.meshing.rendering import render_depth
 from pliant.evaluation.surface_truth import MaterialPoints, SurfaceTruth
 from pliant.evaluation.surfel_truth import rmse
 
+_VIEW = 0.7
+"""Half side of the view whose landmarks make the mesh, in sides of the image."""
 _STEP_PX = 8
 """Between the pixels at which the mesh is compared."""
 
@@ -68,10 +70,7 @@ def judge_deforming_map(file: Path, truth: SurfaceTruth) -> DeformingMapErrors:
     errors = ((in_world(positions) - exact) / depth)[tracked]
     still = ((in_world(found["rest"])[None] - exact) / depth)[tracked]
     camera = in_world(T[:, :3, 3]) - T_true[:, :3, 3]
-    surface = [
-        _mesh_errors(truth, frame, pixels[k][tracked[k]], unit * in_camera[k][tracked[k], 2])
-        for k, frame in enumerate(frames)
-    ]
+    surface = [_mesh_errors(truth, frame, unit * in_camera[k]) for k, frame in enumerate(frames)]
     return DeformingMapErrors(
         keyframes=len(frames),
         landmarks=len(found["rest"]),
@@ -109,9 +108,18 @@ def _material(
     return MaterialPoints(sheet, where)
 
 
-def _mesh_errors(truth: SurfaceTruth, frame: int, points_px: F64, depths: F64) -> tuple[F64, int]:
-    """Relative errors of depth where a Delaunay mesh covers the pixels, and the count of pixels."""
+def _mesh_errors(truth: SurfaceTruth, frame: int, in_camera: F64) -> tuple[F64, int]:
+    """Relative errors of depth where a Delaunay mesh covers the pixels, and the count of pixels.
+
+    in_camera: (L, 3) landmarks.  Those in view, also a little outside of the image, tracked or not,
+    are joined.
+    """
     camera = truth.camera
+    front = in_camera[in_camera[:, 2] > 0.0]
+    points_px, depths = camera.project(front), front[:, 2]
+    size = np.array([camera.width, camera.height])
+    near = (np.abs(points_px - 0.5 * size) < _VIEW * size).all(axis=1)
+    points_px, depths = points_px[near], depths[near]
     found = triangulate(points_px)
     triangles = found.vertices[found.triangles].astype(np.int32)
     at, inverse_depths = points_px.astype(np.float32), (1.0 / depths).astype(np.float32)

@@ -1,15 +1,18 @@
 """Makes ``deforming_map.npz``: the map of a scene that deformed, adjusted as a whole at the end."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
+from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.deformable.adjustment import adjust_deforming
 from pliant.algorithms.deformable.track_choice import choose_tracks
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.slam.calibration.corrected_view import corrected_view
 from pliant.formats.npz import NpzWriter
+from pliant.map_history import MapHistory
 from pliant.messages import topics
 from pliant.messages.types import Extrema
 from pliant.recording.reader import Recording
@@ -26,25 +29,39 @@ def write_deforming_map(path: Path, recording: Path, run: Run) -> str:
 
     Cameras, landmarks and displacements are in world and unit of the map.
     """
-    history, stream = run.history, run.stream
-    segment = history.longest_segment()
-    if stream is None or segment < 0:
+    segment = run.history.longest_segment()
+    if run.stream is None or segment < 0:
         return "the run has no map"
+    # A rigid map that deforms estimates a wrong correction: a calibration that is given counts.
+    correction = run.correction_of(segment) if run.stream.focal_sigma > 0.0 else ()
+    view = corrected_view(run.stream.camera, correction)
+    tracks = Recording(recording).decoded(topics.EXTREMA)
+    seen = (
+        (t.frame, t.ids, view.pixels(t.points_px).astype(np.float64))
+        for t in tracks
+        if isinstance(t, Extrema)
+    )
+    return adjust_and_write(path, run.history, view.camera, seen)
+
+
+def adjust_and_write(
+    path: Path, history: MapHistory, camera: PinholeCamera, tracks: Iterable[tuple[int, I64, F64]]
+) -> str:
+    """The same for a map and the frames, ids (N,) and pixels (N, 2) of its tracks."""
+    segment = history.longest_segment()
     poses = {frame: pose for frame, (of, pose) in history.final().items() if of == segment}
     frames = _spread(np.array(sorted(poses), np.int64), history.stamps_ns)
-    view = corrected_view(stream.camera, run.correction_of(segment))
-    ids: list[I64] = []
-    pixels: list[F64] = []
     wanted = set(frames.tolist())
-    for tracks in Recording(recording).decoded(topics.EXTREMA):
-        assert isinstance(tracks, Extrema)
-        if tracks.frame in wanted:
-            ids.append(tracks.ids)
-            pixels.append(view.pixels(tracks.points_px).astype(np.float64))
-    chosen, landmarks = choose_tracks(ids, pixels, view.camera.width, view.camera.height)
+    of_keyframes = [(ids, pixels) for frame, ids, pixels in tracks if frame in wanted]
+    chosen, landmarks = choose_tracks(
+        [ids for ids, _ in of_keyframes],
+        [pixels for _, pixels in of_keyframes],
+        camera.width,
+        camera.height,
+    )
     T = pose_to_matrix(np.array([poses[frame] for frame in frames.tolist()]))
     try:
-        found = adjust_deforming(chosen, T, view.camera)
+        found = adjust_deforming(chosen, T, camera)
     except (ValueError, np.linalg.LinAlgError):
         return "too few tracks were followed through several keyframes"
     tracked = np.full((len(frames), len(landmarks), 2), np.nan, np.float32)

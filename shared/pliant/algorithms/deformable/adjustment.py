@@ -95,13 +95,13 @@ def adjust_deforming(
     world of the result are those of the start.    Raises ValueError where the tracks determine no
     graph.
     """
-    T, rest, unit = _start(tracks, T_world_camera, camera)
+    T_start, rest, unit = _start(tracks, T_world_camera, camera)
     # A rigid adjustment first: nodes must not explain errors of the start.
-    none = np.zeros((len(T), 0, 3))
+    none = np.zeros((len(T_start), 0, 3))
     rigid = _Adjustment(tracks, camera, no_nodes(len(rest)))
-    state = rigid.minimised(_State(T, rest, none), _RIGID_STEPS)
+    state = rigid.minimised(_State(T_start, rest, none), _RIGID_STEPS)
     graph = node_graph(state.rest, _SPACING)
-    d = np.zeros((len(T), len(graph.nodes), 3))
+    d = np.zeros((len(T_start), len(graph.nodes), 3))
     whole = _Adjustment(tracks, camera, graph)
     state = whole.minimised(_State(state.T, state.rest, d), _STEPS)
     T = state.T.copy()
@@ -130,8 +130,8 @@ def _start(
     A, b = np.zeros((count, 3, 3)), np.zeros((count, 3))
     np.add.at(A, i, across)
     np.add.at(b, i, np.einsum("mij,mj->mi", across, centres))
-    A += 1e-9 * np.eye(3)
-    rest = np.linalg.solve(A, b[:, :, None])[:, :, 0]
+    solved = np.linalg.solve(A + 1e-9 * np.eye(3), b[:, :, None])[:, :, 0]
+    rest = np.asarray(solved, np.float64)
     depths = np.einsum("mi,mi->m", T_world_camera[k, :3, 2], rest[i] - centres)
     unit = float(np.median(depths[depths > 0.0])) if (depths > 0.0).any() else 1.0
     T = T_world_camera.copy()
