@@ -141,7 +141,7 @@ def test_tracks_without_parallax_are_not_reliable() -> None:
 def test_too_few_landmarks_are_refused() -> None:
     points, T = breathing(0.0)
     middle = np.argsort(np.abs(points[0, :, :2]).sum(axis=1))[:3]
-    with pytest.raises(ValueError, match="nodes"):
+    with pytest.raises(ValueError, match="too few"):
         adjust_deforming(tracked(points[:, middle], T), T, CAMERA_640)
 
 

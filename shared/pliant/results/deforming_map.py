@@ -22,6 +22,7 @@ _INTERVAL_NS = 190_000_000
 """Least time between two keyframes: 0.2 s, less the jitter of a clock."""
 _MOST = 150
 """Keyframes; a longer run has them farther apart."""
+_TOO_FEW = "too few tracks were followed through several keyframes"
 
 
 def write_deforming_map(path: Path, recording: Path, run: Run) -> str:
@@ -52,10 +53,13 @@ def adjust_and_write(
     poses = {frame: pose for frame, (of, pose) in history.final().items() if of == segment}
     frames = _spread(np.array(sorted(poses), np.int64), history.stamps_ns)
     wanted = set(frames.tolist())
-    of_keyframes = [(ids, pixels) for frame, ids, pixels in tracks if frame in wanted]
+    seen = {frame: (ids, pixels) for frame, ids, pixels in tracks if frame in wanted and len(ids)}
+    if not seen:
+        return _TOO_FEW
+    frames = np.array(list(seen), np.int64)
     chosen, landmarks = choose_tracks(
-        [ids for ids, _ in of_keyframes],
-        [pixels for _, pixels in of_keyframes],
+        [ids for ids, _ in seen.values()],
+        [pixels for _, pixels in seen.values()],
         camera.width,
         camera.height,
     )
@@ -63,7 +67,7 @@ def adjust_and_write(
     try:
         found = adjust_deforming(chosen, T, camera)
     except (ValueError, np.linalg.LinAlgError):
-        return "too few tracks were followed through several keyframes"
+        return _TOO_FEW
     tracked = np.full((len(frames), len(landmarks), 2), np.nan, np.float32)
     tracked[chosen.keyframes, chosen.landmarks] = chosen.points_px
     kept = np.flatnonzero(found.reliable)

@@ -45,7 +45,7 @@ from pliant.algorithms.deformable.linearised import (
     times,
     times_transposed,
 )
-from pliant.algorithms.deformable.moving_landmarks import DeformingMap, TrackedPoints
+from pliant.algorithms.deformable.moving_landmarks import NEAREST, DeformingMap, TrackedPoints
 from pliant.algorithms.deformable.node_graph import NodeGraph, no_nodes, node_graph
 from pliant.algorithms.deformable.priors import Prior
 from pliant.algorithms.geometry import so3_exp
@@ -95,6 +95,8 @@ def adjust_deforming(
     world of the result are those of the start.    Raises ValueError where the tracks determine no
     graph.
     """
+    if len(np.unique(tracks.landmarks)) < NEAREST:
+        raise ValueError("too few landmarks")
     T_start, rest, unit = _start(tracks, T_world_camera, camera)
     # A rigid adjustment first: nodes must not explain errors of the start.
     none = np.zeros((len(T_start), 0, 3))
