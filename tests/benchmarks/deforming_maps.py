@@ -22,7 +22,6 @@ _SOURCES = tuple(
     f"built-in:breathing?seconds=8&{options}"
     for options in (
         "amplitude=0&travel=0.25",
-        "amplitude=0.01&travel=0.25",
         "amplitude=0.03&travel=0.25",
         "amplitude=0.03",
         "amplitude=0.08&travel=0.25",
