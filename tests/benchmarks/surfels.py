@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.deforming_maps import measure_maps
 from benchmarks.surfel_limits import measure_limits
 from benchmarks.surfel_losses import measure_losses
 from benchmarks.surfel_sequences import Sequence, load
@@ -41,7 +42,7 @@ _HEADER = (
     ),
     *("dragged", "AUC", "AUC in view", "AUC 1 px", "camera %", "until loss", "ms a frame"),
 )
-LIMITS, LOSSES = "limits", "losses"
+LIMITS, LOSSES, MAPS = "limits", "losses", "maps"
 TABLES = (
     "targets",
     "models",
@@ -53,6 +54,7 @@ TABLES = (
     "light",
     LIMITS,
     LOSSES,
+    MAPS,
 )
 
 
@@ -94,6 +96,9 @@ def measure(
             continue
         if name == LOSSES:
             yield from measure_losses(sources, tracks, surfels)
+            continue
+        if name == MAPS:
+            yield from measure_maps(sources)
             continue
         rows = _rows(name, list(sources), tracks)
         rows = _fewer(rows) if quick else rows

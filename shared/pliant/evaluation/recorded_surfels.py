@@ -18,12 +18,13 @@ from pliant.datasets.depth import DepthRectifier
 from pliant.datasets.rectifier import Rectifier
 from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import ResultError
+from pliant.evaluation.deforming_map_truth import format_deforming_map, judge_deforming_map
 from pliant.evaluation.exact_surfels import ExactSurfels, format_exact
 from pliant.evaluation.later_surfels import LaterSurfels, format_later, scaled, true_scale
 from pliant.evaluation.surface_truth import SurfaceTruth
 from pliant.evaluation.surfel_truth import SurfelTruth, format_surfels, mean_rows
 from pliant.recording.reader import Recording
-from pliant.results.folder import RECORDING_NAME
+from pliant.results.folder import DEFORMING_MAP_NAME, RECORDING_NAME
 from pliant.results.surfels import is_metric, recorded_surfels
 
 
@@ -89,7 +90,13 @@ def _against_surfaces(result: Path, folder: Path, figures: dict[str, Any]) -> st
         "roc": {"false_positive": false[kept].tolist(), "true_positive": true[kept].tolist()},
     }
     text = format_exact(judge, moving_camera=truth.moving_camera)
-    return f"{text}\n{format_later(later)}" if later.summary()["births"] else text
+    if later.summary()["births"]:
+        text += "\n" + format_later(later)
+    if (result / DEFORMING_MAP_NAME).is_file():
+        errors = judge_deforming_map(result / DEFORMING_MAP_NAME, truth)
+        figures["final_map"] = asdict(errors)
+        text += "\n" + format_deforming_map(errors)
+    return text
 
 
 def _nothing(result: Path) -> str:

@@ -63,6 +63,12 @@ class SurfaceTruth:
         )
         return MaterialPoints(sheet, where)
 
+    def depths(self, frame: int, points_px: F64) -> F64:
+        """(N,) depth along the optical axis at (N, 2) pixels; 0: no sheet."""
+        return look_at_pixels(
+            self.sheets(frame), self.T_world_camera[frame], self.camera, points_px
+        )[2]
+
     def positions(self, points: MaterialPoints, frame: int) -> F64:
         """(N, 3) metres, world; NaN where there is no sheet."""
         out = np.full((len(points.sheet), 3), np.nan)

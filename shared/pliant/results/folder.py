@@ -38,6 +38,7 @@ SESSION_NAME = "session.json"
 CALIBRATION_NAME = "calibration.yaml"
 TRAJECTORY_NAME = "trajectory.txt"
 SURFELS_NAME = "surfels.npz"
+DEFORMING_MAP_NAME = "deforming_map.npz"
 _RIGID_FILES = (
     TRAJECTORY_NAME,
     "trajectory_online.txt",
@@ -50,8 +51,9 @@ _RIGID_FILES = (
 SURFEL_FILES = (TRAJECTORY_NAME, SURFELS_NAME, REPORT_NAME, PAGE_NAME)
 SCALE_NAME = "scale.yaml"
 MESH_ERROR_NAME = "mesh_error.png"
-SOMETIMES = (MAP_NAME, SCALE_NAME, MESH_ERROR_NAME)
-"""Files of a completed map, of a map with a known scale, and of an evaluated mesh."""
+SOMETIMES = (MAP_NAME, SCALE_NAME, MESH_ERROR_NAME, DEFORMING_MAP_NAME)
+"""Files of a completed map, of a map with a known scale, of an evaluated mesh, and of a map that
+deforms."""
 MESH_FILES = ("mesh.ply", "mesh_coarse.ply", "mesh.png", "mesh_shaded.png", "mesh_normals.png")
 _SWITCHING = ".results-whole"
 """Results that are whole, and on their way to their places."""

@@ -16,7 +16,9 @@ from pliant.formats.tum import write_tum
 from pliant.messages import topics
 from pliant.messages.types import DROPPED, MASKED, WAITING_FOR_DEPTH, CameraStream, Surfels
 from pliant.recording.reader import Recording
+from pliant.results.deforming_map import write_deforming_map
 from pliant.results.folder import (
+    DEFORMING_MAP_NAME,
     PAGE_NAME,
     RECORDING_NAME,
     REPORT_NAME,
@@ -96,6 +98,9 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
                     surface.take(surfels)
         write_tum(folder / TRAJECTORY_NAME, _trajectory(followed))
         report = _report(run, counts, len(followed))
+        if recorded_config(run.recorded.metadata, []).surfels.final_map:
+            why = write_deforming_map(folder / DEFORMING_MAP_NAME, recording, run)
+            report["deforming_map"] = why or "made"
         text = json.dumps(report, indent=1) + "\n"
         (folder / REPORT_NAME).write_text(text, encoding="utf-8")
         names = {path.name for path in folder.iterdir()} | {RECORDING_NAME}

@@ -1,0 +1,1 @@
+"""Cameras, rest shape and displacements of a scene that deforms, adjusted together."""
