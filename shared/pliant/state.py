@@ -41,7 +41,7 @@ _CLASSES = {
 }
 """Classes that are neither dataclasses, named tuples, nor parameters."""
 _FUNCTIONS = {"no_stages"}
-_CONSTANT = {"GyroSignal"}
+_CONSTANT = {"GyroSignal", "ImuSamples"}
 """Records that never change: a state names them where there is a store for them."""
 
 _PLAIN = (type(None), bool, float, str, bytes)

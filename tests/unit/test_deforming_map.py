@@ -107,3 +107,12 @@ def test_tracks_that_end_at_once_make_no_map(truth: SurfaceTruth, tmp_path: Path
     assert "too few tracks" in adjust_and_write(file, rigid_map(truth), CAMERA, fresh)
     assert "too few tracks" in adjust_and_write(file, rigid_map(truth), CAMERA, [])
     assert not file.exists()
+
+
+def test_landmarks_that_nothing_determines_make_no_map(truth: SurfaceTruth, tmp_path: Path) -> None:
+    """Pixels by chance: none fits."""
+    generator = np.random.default_rng(0)
+    chance = [(f, ids, generator.uniform(0.0, 200.0, px.shape)) for f, ids, px in tracks(truth)]
+    file = tmp_path / "deforming_map.npz"
+    assert adjust_and_write(file, rigid_map(truth), CAMERA, chance) == "no landmark is reliable"
+    assert not file.exists()

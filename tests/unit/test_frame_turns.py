@@ -1,15 +1,17 @@
 """What images show of a camera's turns, where its poses have a prior by the gyro."""
 
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import so3_exp, so3_log
+from pliant.algorithms.geometry import move_by_similarity, so3_exp, so3_log
 from pliant.algorithms.inertial.gyro import GyroTurn
-from pliant.algorithms.slam.active.frame_turns import FrameTurns
+from pliant.algorithms.slam.active.frame_turns import ByImage, FrameTurns
 from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.locate.localisation import Motion
 from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.slam.parameters import MappingParameters
 from pliant.algorithms.tracks import FrameExtrema
@@ -49,8 +51,8 @@ class WrongGyro:
         wrong = so3_exp(np.array([0.0, -0.01 * frames + 1e-3, 0.0]))
         return GyroTurn(R=wrong, covariance=1e-10 * np.eye(3))
 
-    def see(self, first_ns: int, second_ns: int, R: F64, variance: float) -> None:
-        self.shown.append((R, variance))
+    def see(self, first_ns: int, second_ns: int, R: F64, variances: tuple[float, float]) -> None:
+        self.shown.append((R, sum(variances)))
 
 
 def test_a_gyro_is_judged_by_images_without_its_own_part_in_the_pose() -> None:
@@ -75,3 +77,24 @@ def test_a_gyro_is_judged_by_images_without_its_own_part_in_the_pose() -> None:
     # Later ones are those in a map whose landmarks have been dragged along.
     assert max(by_images) < 0.5 * max(dragged)
     assert all(0.0 < variance < 2.0 * (1.0 / CAMERA.fx) ** 2 for _, variance in gyro.shown)
+
+
+def test_a_world_that_moves_before_a_turn_is_shown_changes_no_turn() -> None:
+    """As where a keyframe corrects the calibration, and with it the map."""
+    S = np.eye(4)
+    S[:3, :3] = 1.7 * so3_exp(np.array([0.4, -0.2, 0.3]))
+    shown: list[F64] = []
+    for move in (np.eye(4), S):
+        gyro, motion = WrongGyro(), Motion.at(9, 9 * STEP_NS, np.eye(4))
+        turns = FrameTurns(gyro)  # type: ignore[arg-type]
+        turns.here = ByImage(stamp_ns=10 * STEP_NS, R=R_world_camera(2), variance=0.1)
+        turns.follow(move)
+        placed = SimpleNamespace(
+            frame=SimpleNamespace(stamp_ns=10 * STEP_NS),
+            T_world_camera=move_by_similarity(move, np.eye(4)),
+        )
+        turns.see(motion.moved(move), placed)  # type: ignore[arg-type]
+        ((R, _),) = gyro.shown
+        shown.append(R)
+    np.testing.assert_allclose(shown[0], R_world_camera(2), atol=1e-12)
+    np.testing.assert_allclose(shown[1], shown[0], atol=1e-12)

@@ -45,3 +45,26 @@ def test_the_mesh_follows_its_surfels_and_has_the_colour_of_their_strain() -> No
     assert (stretched[:, 0] - stretched[:, 2] > 100).all()
     assert (compressed[:, 2] - compressed[:, 0] > 100).all()
     assert len(nothing.triangles) == 0
+
+
+def test_a_rolled_camera_and_a_dark_frame_leave_the_strain_as_it_is() -> None:
+    drawn = Drawn()
+    scene = SceneSurfels(cast(Canvas, drawn))
+    scene.camera = PinholeCamera(width=600, height=600, fx=500, fy=500, cx=300, cy=300)
+    start, stretched = surfels_in(0, 0.0), surfels_in(1, 0.15)
+    # Only one Delaunay triangulation: no four of them are on a circle.
+    chance = np.random.default_rng(0).normal(size=(121, 2)).astype(np.float32)
+    u, v = (start.points_px - np.float32(300.0) + chance).T
+    start = replace(start, points_px=np.stack([u, v], axis=1) + np.float32(300.0))
+    dark = replace(start, state=np.full(121, SurfelState.LOST, np.uint8))
+    quarters = [(u, v), (-v, u), (-u, -v), (v, -u)]
+    rolled = [
+        replace(stretched, points_px=np.stack(q, axis=1) + np.float32(300.0)) for q in quarters
+    ]
+    for frame in (start, dark, *rolled):
+        scene.take(Moment(frame.frame, frame.stamp_ns), frame)
+    meshes = drawn.meshes[2:]
+    assert len({tuple(mesh.triangles[0]) for mesh in meshes}) > 1
+    for mesh in meshes:
+        assert len(mesh.triangles) > 190
+        assert (mesh.colours[:, 0].astype(int) - mesh.colours[:, 2] > 100).all()

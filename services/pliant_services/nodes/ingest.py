@@ -127,7 +127,7 @@ def run(
         monitor.report(image, note=str(error), **counters)
         _publish_heard(bus, heard, complete=False)
         raise SourceLostError(str(error)) from None
-    _publish_heard(bus, heard, complete=not stopping())
+    _publish_heard(bus, heard, complete=True)
 
 
 def _publish(bus: Bus, measured: Measurements, *, complete: bool = True) -> None:

@@ -13,10 +13,9 @@ from collections.abc import Iterable
 import numpy as np
 
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.meshing.decimation import decimated
 from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints
 from pliant.algorithms.meshing.parameters import SurfaceParameters, TsdfParameters
-from pliant.algorithms.meshing.rendering import DepthMap, view_mesh
+from pliant.algorithms.meshing.rendering import DepthMap
 from pliant.algorithms.meshing.tsdf_volume import TsdfVolume
 from pliant.bus.base import Bus, join, receive, receive_one
 from pliant.config import Config
@@ -100,10 +99,6 @@ def warm_up() -> None:
     volume.integrate(found.depths, found.weights, colour, camera, pose)
     volume.extract_finished()
     _warm_up_stereo(camera, points)
-    # Pictures of the results need these: the launcher makes them.
-    corners, faces = points.points_world.astype(np.float32), np.arange(99, dtype=np.int32)
-    mesh = decimated(corners, np.zeros((n, 3), np.uint8), faces.reshape(-1, 3), 32)
-    view_mesh(mesh[0], mesh[2], camera, pose)
 
 
 def _warm_up_stereo(camera: PinholeCamera, points: SeenPoints) -> None:

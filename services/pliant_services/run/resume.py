@@ -29,7 +29,10 @@ def resumed_config(output: Path, request: RunRequest) -> Config:
     begun = parts.exists(output / RECORDING_NAME)
     if not (output / STATE_FOLDER).is_dir() and (not begun or (output / REPORT_NAME).exists()):
         raise ResultError(f"{output}: {_OVER if begun else _NONE}")
-    kept = load_config(output / CONFIG_NAME)
+    try:
+        kept = load_config(output / CONFIG_NAME)
+    except ConfigError as error:
+        raise ResultError(f"{error}; resume with the release that began, or start again") from None
     said = request.overrides or request.config_file or request.seed is not None
     if said and kept != load_config(request.config_file, request.overrides, seed=request.seed):
         raise ResultError(

@@ -59,7 +59,7 @@ def colours_at(pixels: U8, points_px: F32) -> U8:
     column, row = np.rint(points_px).astype(np.int64).T
     height, width = pixels.shape[:2]
     colours = pixels[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
-    return np.broadcast_to(colours.reshape(len(points_px), -1), (len(points_px), 3))
+    return np.broadcast_to(colours.reshape(-1, *pixels.shape[2:] or (1,)), (len(points_px), 3))
 
 
 def overlay_pictures(recording: Recording) -> Iterator[U8]:

@@ -22,7 +22,7 @@ _INTERVAL_NS = 190_000_000
 """Least time between two keyframes: 0.2 s, less the jitter of a clock."""
 _MOST = 150
 """Keyframes; a longer run has them farther apart."""
-_TOO_FEW = "too few tracks were followed through several keyframes"
+_TOO_FEW = "too few tracks through several keyframes determine it"
 
 
 def write_deforming_map(path: Path, recording: Path, run: Run) -> str:
@@ -66,8 +66,10 @@ def adjust_and_write(
     T = pose_to_matrix(np.array([poses[frame] for frame in frames.tolist()]))
     try:
         found = adjust_deforming(chosen, T, camera)
-    except (ValueError, np.linalg.LinAlgError):
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return _TOO_FEW
+    if not found.reliable.any():
+        return "no landmark is reliable"
     tracked = np.full((len(frames), len(landmarks), 2), np.nan, np.float32)
     tracked[chosen.keyframes, chosen.landmarks] = chosen.points_px
     kept = np.flatnonzero(found.reliable)

@@ -99,8 +99,9 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
         write_tum(folder / TRAJECTORY_NAME, _trajectory(followed))
         report = _report(run, counts, len(followed))
         if recorded_config(run.recorded.metadata, []).surfels.final_map:
-            why = write_deforming_map(folder / DEFORMING_MAP_NAME, recording, run)
-            report["deforming_map"] = why or "made"
+            report["deforming_map"] = write_deforming_map(
+                folder / DEFORMING_MAP_NAME, recording, run
+            )
         text = json.dumps(report, indent=1) + "\n"
         (folder / REPORT_NAME).write_text(text, encoding="utf-8")
         names = {path.name for path in folder.iterdir()} | {RECORDING_NAME}
@@ -161,6 +162,8 @@ def surfel_summary(report: dict[str, Any]) -> list[str]:
             f"tracking was lost in {counted(len(report['frames_lost']), 'frame')}, first "
             f"{report['frames_lost'][0]}; it restarts where there is depth"
         )
+    if report.get("deforming_map"):
+        lines.append(f"no {DEFORMING_MAP_NAME}: {report['deforming_map']}")
     return lines
 
 

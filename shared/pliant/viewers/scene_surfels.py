@@ -17,7 +17,7 @@ _PATH_FRAMES = 10
 _FULL_STRAIN = 0.1
 """Strain with the full colour: the largest of the run is not known yet."""
 _FORGET = 4
-"""More triangles than this for each one that is shown are old, and forgotten."""
+"""Old triangles are forgotten at so many times the largest number that a frame has shown."""
 
 
 class SceneSurfels:
@@ -31,6 +31,7 @@ class SceneSurfels:
         self._path: list[F64] = []
         self._drawn = -_PATH_FRAMES
         self._rest: dict[tuple[int, ...], F64] = {}  # sides of each triangle when it came, by ids
+        self._most = 0
 
     def take(self, at: Moment, surfels: Surfels) -> None:
         """Draw the surfels of a frame; nothing where it has none."""
@@ -53,11 +54,15 @@ class SceneSurfels:
     def _surface(self, surfels: Surfels) -> TriangleMesh:
         """The mesh between the tracked surfels, coloured by its strain since each part came."""
         rows, normals, triangles = surface_of(surfels)
+        names = surfels.ids[rows][triangles]
+        first = names.argmin(axis=1)[:, None]  # the same triangle from any corner
+        triangles = np.take_along_axis(triangles, (first + np.arange(3)) % 3, axis=1)
         corners = surfels.positions[rows][triangles]
         sides = corners[:, 1:] - corners[:, :1]
         names = [tuple(ids) for ids in surfels.ids[rows][triangles].tolist()]
         rest = [self._rest.setdefault(*pair) for pair in zip(names, sides, strict=True)]
-        if len(self._rest) > _FORGET * len(names):
+        self._most = max(self._most, len(names))
+        if len(self._rest) > _FORGET * self._most:
             self._rest = dict(zip(names, rest, strict=True))
         strain = principal_strains(np.array(rest).reshape(-1, 2, 3), sides)
         values = at_vertices(triangles, strain, len(rows))

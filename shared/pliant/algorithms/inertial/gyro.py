@@ -158,11 +158,15 @@ class Gyro:
         return self._turned(aligned, first_ns, second_ns)
 
     def see(
-        self, first_ns: int, second_ns: int, R_first_second: F64, variance: float = 0.0
+        self,
+        first_ns: int,
+        second_ns: int,
+        R_first_second: F64,
+        variances: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         """Take in the rotation between successive frames by their images alone.
 
-        variance: of its largest error, rad^2, as far as it is known.
+        variances: of the largest error of the first and the second rotation, rad^2, where known.
         """
         if self.is_over:
             return
@@ -177,7 +181,7 @@ class Gyro:
         self._unexplained_s += 0.0 if self.is_believed else second_s - first_s
         if second_s - self._times_s[0] > 2.0 * _MOST_S:
             self._forget_before(second_s - _MOST_S)
-        self._judge(first_ns, second_ns, R_first_second, variance)
+        self._judge(first_ns, second_ns, R_first_second, variances)
         if not self.is_believed and self._unexplained_s > _GIVEN_UP_S:
             self.given_up = True
             self._leave()
@@ -208,11 +212,13 @@ class Gyro:
         self._times_s, self._turns, self._interval = [], [], None
         self._aligned = self._earlier = None
 
-    def _judge(self, first_ns: int, second_ns: int, R_first_second: F64, variance: float) -> None:
-        """Compare an interval of frames with the gyro."""
-        start_ns, R_before, variance_before = self._interval or (first_ns, np.eye(3), 0.0)
-        R, variance = R_before @ R_first_second, variance_before + variance
-        self._interval = (start_ns, R, variance)
+    def _judge(
+        self, first_ns: int, second_ns: int, R_first_second: F64, variances: tuple[float, float]
+    ) -> None:
+        """Compare an interval of frames with the gyro.  The rotations between its ends cancel."""
+        start_ns, R_before, at_start = self._interval or (first_ns, np.eye(3), variances[0])
+        R = R_before @ R_first_second
+        self._interval = (start_ns, R, at_start)
         if (second_ns - start_ns) * 1e-9 < AVERAGED_S or self._aligned is None:
             return
         self._interval = None
@@ -221,7 +227,8 @@ class Gyro:
             return
         allowed = _APART * float(max(np.linalg.norm(so3_log(R)), np.linalg.norm(so3_log(told.R))))
         apart = float(np.linalg.norm(so3_log(told.R.T @ R)))
-        variance += self._aligned.noise**2 + float(np.linalg.norm(told.covariance, 2))
+        variance = at_start + variances[1] + self._aligned.noise**2
+        variance += float(np.linalg.norm(told.covariance, 2))
         unsure = _SIGMAS * float(np.sqrt(variance))
         if apart > allowed + unsure:
             self._agreed.append(False)

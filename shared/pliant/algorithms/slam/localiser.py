@@ -183,7 +183,7 @@ class Localiser(FrameMapper):
         placed = reacquire_points(active, self._motion, frame, T_world_camera)
         interval_s = 0.0 if self._motion is None else self._motion.interval_s()
         settled = frame.tracks.ages * interval_s >= self._parameters.support.settled_s
-        placed = with_support(active, placed, frame.tracks.points_px[settled])
+        placed = with_support(active, placed, placed.frame.tracks.points_px[settled])
         judge_tracks(active, placed)
         return placed
 

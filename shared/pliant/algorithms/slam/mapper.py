@@ -221,6 +221,7 @@ class Mapper:
         """Move the motion model with the map, and publish the move."""
         for each in moved:
             self._motion = self._motion.moved(each.S)
+            self._turns.follow(each.S)
             if each.moves is not None:
                 self.journal.move(each.moves)
             if each.gone is not None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I32
+from pliant.algorithms.arrays import F64, I32, I64
 from pliant.algorithms.surfels.surface_over_time import SurfaceOverTime
 
 
@@ -11,12 +11,19 @@ def strains(surface: SurfaceOverTime) -> F64:
 
     0.1 is 10 % longer, -0.1 is 10 % shorter than in the first frame that shows the triangle.
     """
-    corners = surface.positions[:, surface.triangles]  # (K, T, 3, 3)
-    sides = corners[:, :, 1:] - corners[:, :, :1]
+    out = np.full(surface.shown.shape, np.nan)
     first = surface.shown.argmax(axis=0)
-    rest = sides[first, np.arange(len(first))]
-    out = principal_strains(np.broadcast_to(rest, sides.shape).reshape(-1, 2, 3), sides)
-    return np.where(surface.shown, out.reshape(surface.shown.shape), np.nan)
+    rest = _sides(surface, first, np.arange(len(first)))
+    for frame, shown in enumerate(surface.shown):
+        rows = np.flatnonzero(shown)
+        out[frame, rows] = principal_strains(rest[rows], _sides(surface, frame, rows))
+    return out
+
+
+def _sides(surface: SurfaceOverTime, frames: int | I64, rows: I64) -> F64:
+    """(M, 2, 3) of some triangles, in a frame, or each in its own."""
+    corners = surface.positions[np.expand_dims(frames, -1), surface.triangles[rows]]
+    return corners[:, 1:] - corners[:, :1]
 
 
 def principal_strains(rest: F64, now: F64) -> F64:

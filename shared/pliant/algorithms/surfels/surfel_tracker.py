@@ -209,9 +209,10 @@ class SurfelTracker:
         """
         table, p, camera = self._table, self._parameters, self._camera
         assert camera is not None
-        if self._since_birth_s < p.lost_after_s or 0.0 < self._lost_for_s < p.lost_after_s:
+        gone = self._lost or self._lost_for_s > 0.0
+        if self._since_birth_s < p.lost_after_s or (gone and self._lost_for_s < p.lost_after_s):
             return None
-        if self._lost_for_s > 0.0:
+        if gone:
             self._lost = True
             return np.ones((camera.height, camera.width))
         points = table.validations[table.tracked, validation.U : validation.V + 1]

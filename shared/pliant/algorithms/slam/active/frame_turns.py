@@ -60,6 +60,12 @@ class FrameTurns:
             R, variance = rotation_by_image(active, placed)
             self.here = ByImage(stamp_ns=placed.frame.stamp_ns, R=R, variance=variance)
 
+    def follow(self, S: F64) -> None:
+        """Move what the image of this frame shows with the world, by a similarity (4, 4)."""
+        if self.here is not None:
+            R = S[:3, :3] / np.cbrt(np.linalg.det(S[:3, :3]))
+            self.here = replace(self.here, R=R @ self.here.R)
+
     def see(self, motion: Motion, placed: PlacedFrame) -> None:
         """Show the gyro how the camera has turned to a frame.   motion: before it."""
         gyro, stamp_ns, last = self.gyro, placed.frame.stamp_ns, self.last
@@ -70,9 +76,8 @@ class FrameTurns:
             here = ByImage(stamp_ns=stamp_ns, R=R, variance=0.0)
         before_ns, before = motion.stamps_ns[1], motion.poses[1][:3, :3]
         if before_ns < stamp_ns:
-            variance = here.variance
+            at_first = 0.0
             if last is not None and last.stamp_ns == before_ns:
-                before = before @ self.R_last.T @ last.R
-                variance += last.variance
-            gyro.see(before_ns, stamp_ns, before.T @ here.R, variance)
+                before, at_first = before @ self.R_last.T @ last.R, last.variance
+            gyro.see(before_ns, stamp_ns, before.T @ here.R, (at_first, here.variance))
         self.last, self.R_last, self.here = here, R, None
