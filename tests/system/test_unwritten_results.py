@@ -65,6 +65,16 @@ def test_what_was_cut_off_cannot_be_resumed(tiny_run: Path, tmp_path: Path) -> N
     assert_one_line(done, "started without --on-crash restart, and cannot resume")
 
 
+def test_a_run_of_another_release_names_what_it_does_not_know(
+    tiny_run: Path, tmp_path: Path
+) -> None:
+    folder = unwritten(tiny_run, tmp_path / "tiny")
+    (folder / "config.yaml").write_text("tracking: {no_such_key: true}\n")
+    done = in_this_process("run", TINY, "--resume", "--output", folder)
+    assert_one_line(done, "no_such_key")
+    assert "resume with the release that began" in done.stderr
+
+
 def test_a_service_that_is_killed_while_it_starts_is_started_again(
     tiny_run: Path, tmp_path: Path
 ) -> None:

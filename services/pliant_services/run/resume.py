@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pliant.config import Config, load_config
-from pliant.errors import ResultError
+from pliant.errors import ConfigError, ResultError
 from pliant.recording import parts
 from pliant.recording.map_file import MapFile
 from pliant.recording.recover import mend
