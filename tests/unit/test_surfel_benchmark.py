@@ -4,12 +4,13 @@ import re
 from pathlib import Path
 
 import pytest
-from benchmarks import surfels
-from benchmarks.surfels import LIMITS, LOSSES, TABLES, measure
+from benchmarks import deforming_maps, surfels
+from benchmarks.surfels import LIMITS, LOSSES, MAPS, TABLES, measure
 
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.datasets.builtin import parse_builtin
 from pliant.errors import DatasetError
+from pliant.evaluation.deforming_map_truth import DeformingMapErrors
 
 
 def lines(sources: list[str], tables: list[str], *, quick: bool = False) -> list[str]:
@@ -47,7 +48,7 @@ def test_a_folder_without_exact_surfaces_has_the_figures_that_depth_gives(
     assert float(figures["ms a frame"]) > 0.0
 
 
-@pytest.mark.parametrize("table", [name for name in TABLES if name not in (LIMITS, LOSSES)])
+@pytest.mark.parametrize("table", [name for name in TABLES if name not in (LIMITS, LOSSES, MAPS)])
 def test_every_table_names_sequences_that_there_are(
     table: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -67,6 +68,20 @@ def test_every_table_names_sequences_that_there_are(
     assert len(opened) == len(set(opened)) >= 3
     assert len(said) >= 2 + len(opened)
     assert not any("tracks=" in line for line in said)
+
+
+def test_the_table_of_maps_names_sequences_that_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    judged: list[str] = []
+
+    def errors(source: str) -> DeformingMapErrors:
+        parse_builtin(source)
+        judged.append(source)
+        return DeformingMapErrors(9, 99, *[0.01] * 7)
+
+    monkeypatch.setattr(deforming_maps, "_judged", errors)
+    said = list(measure([], tracks=None, tables=[MAPS], frames=9, surfels=20, quick=False))
+    assert len(judged) == len(set(judged)) >= 3
+    assert sum("1.00" in line for line in said) == len(judged)
 
 
 def test_mistakes_are_one_line() -> None:

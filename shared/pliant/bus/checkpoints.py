@@ -24,6 +24,7 @@ import msgpack
 from pliant.errors import BusError, StateError
 from pliant.files import create, make_folder, put_in_place
 from pliant.state import load_state, save_state
+from pliant.wording import shown
 
 _VERSION = 1
 
@@ -139,7 +140,7 @@ class Checkpoints:
     def kept(self, name: str) -> Any:
         """The record that a checkpoint names.  Raises BusError and StateError."""
         if not name.isalnum():
-            raise StateError(f"{self._folder}: not a name of a record: {name!r}")
+            raise StateError(f"{self._folder}: not a name of a record: {shown(name)}")
         path = self._constant(name)
         try:
             record = load_state(path.read_bytes())

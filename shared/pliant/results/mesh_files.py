@@ -16,6 +16,7 @@ from pliant.messages.mesh_pieces import joined
 from pliant.messages.types import MeshPiece
 from pliant.pictures.mesh import draw_mesh, mesh_view
 from pliant.pictures.movie import write_image
+from pliant.wording import shown
 
 MESHED_NAME = "mesh.json"
 """Report of ``pliant mesh``, in a folder of its own."""
@@ -97,8 +98,8 @@ def run_of(folder: Path) -> Path:
         return folder
     try:
         recording = folder.resolve() / json.loads(report.read_text(encoding="utf-8"))[_RECORDING]
-    except (ValueError, KeyError, TypeError) as error:
-        raise ResultError(f"{report}: names no recording ({error!r}): mesh it again") from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ResultError(f"{report}: names no recording ({shown(error)}): mesh it again") from None
     if not recording.exists():
         raise ResultError(f"{report}: its recording {recording} is gone: mesh it again")
     return recording.parent
