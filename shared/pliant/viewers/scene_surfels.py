@@ -17,7 +17,7 @@ _PATH_FRAMES = 10
 _FULL_STRAIN = 0.1
 """Strain with the full colour: the largest of the run is not known yet."""
 _FORGET = 4
-"""Old triangles are forgotten at so many times the largest number that a frame has shown."""
+"""Old triangles are forgotten at this multiple of the largest number that a frame has shown."""
 
 
 class SceneSurfels:
