@@ -42,9 +42,9 @@ def node_graph(rest: F64, spacing: float) -> NodeGraph:
 
     Raises ValueError for fewer than NEAREST nodes.
     """
-    while len(_apart(rest, spacing)) > _MOST:
+    while len(chosen := _apart(rest, spacing)) > _MOST:
         spacing *= 1.2
-    nodes = rest[_apart(rest, spacing)]
+    nodes = rest[chosen]
     if len(nodes) < NEAREST:
         raise ValueError(f"{len(nodes)} nodes: the landmarks are too close together")
     near, apart = _nearest(nodes, nodes, min(_JOINED + 1, len(nodes)))

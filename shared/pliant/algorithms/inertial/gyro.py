@@ -50,7 +50,7 @@ _ITERATIONS = 4
 _CHANGE = 0.002
 """Seconds by which offsets differ for the derivative."""
 _AROUND_S = 2.0
-"""Of samples beyond those of the turns: by more the offset never changes."""
+"""Seconds of samples kept on both sides of the turns: the offset never changes by more."""
 _BIAS, _OFFSET = np.arange(3, 6), 6
 """Rows among the unknowns."""
 _BIAS_RAD_S, _TURN_RAD, _OFFSET_S = 0.2, 10.0, 1.0
@@ -147,7 +147,7 @@ class Gyro:
 
     @property
     def is_over(self) -> bool:
-        """Whether it tells nothing any more."""
+        """Whether the gyro is no longer used."""
         return self.dropped or self.given_up
 
     def turn(self, first_ns: int, second_ns: int) -> GyroTurn | None:
@@ -207,7 +207,7 @@ class Gyro:
         self._times_s, self._turns = self._times_s[kept:], self._turns[kept:]
 
     def _leave(self) -> None:
-        """Keep nothing that is of no use any more."""
+        """Discard what is no longer used."""
         self.signal = GyroSignal(times_s=_NO_SAMPLES[0], gyro=_NO_SAMPLES[1])
         self._times_s, self._turns, self._interval = [], [], None
         self._aligned = self._earlier = None

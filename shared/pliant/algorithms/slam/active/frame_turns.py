@@ -29,7 +29,9 @@ class FrameTurns:
     The gyro's rotation is a prior of a frame's pose, so that pose cannot judge the gyro.  What the
     image alone shows can.
 
-    R_last: the last pose whose image was shown to the gyro; it moves with the world, its image not.
+    last: the image that was shown to the gyro last.   R_last: rotation of its pose at that time,
+    so R_last^T last.R is the difference between pose and image, in whatever world.
+    here: the image of the current frame, in the current world.
     """
 
     gyro: Gyro | None
