@@ -244,7 +244,7 @@ class MapHistory(CurrentMap):
         self.states[frame] = (delta.state, delta.reason)
         known = self.frames.get(frame)
         if known is not None and known.inliers >= MIN_INLIERS:
-            self.online[frame] = (known.segment, matrix_to_pose(self._world(known)))
+            self.online[frame] = (known.segment, matrix_to_pose(self._world(known))[0])
 
     def _scale(self, moves: MapMoves) -> None:
         """Distances of frames to their keyframes scale as the whole map moves."""
@@ -267,10 +267,15 @@ class MapHistory(CurrentMap):
         return self._placed(lambda pose: pose.inliers >= MIN_INLIERS or pose.inliers == BY_GYRO)
 
     def _placed(self, chosen: Callable[[FramePose], bool]) -> dict[int, tuple[int, F64]]:
-        return {
-            frame: (pose.segment, matrix_to_pose(self._world(pose)))
+        placed = {
+            frame: pose
             for frame, pose in sorted(self.frames.items(), key=lambda item: item[0])
             if chosen(pose) and pose.keyframe in self.keyframes
+        }
+        poses = matrix_to_pose(self._world(*placed.values())) if placed else ()
+        return {
+            frame: (pose.segment, T_world_camera)
+            for (frame, pose), T_world_camera in zip(placed.items(), poses, strict=True)
         }
 
     def same_places_in(self, segment: int) -> F64:
@@ -282,8 +287,9 @@ class MapHistory(CurrentMap):
     def longest_segment(self) -> int:
         """The segment with the most supported frames (the earliest of equals); -1 without any."""
         counts: dict[int, int] = {}
-        for segment, _ in self.final().values():
-            counts[segment] = counts.get(segment, 0) + 1
+        for _, pose in sorted(self.frames.items(), key=lambda item: item[0]):
+            if pose.inliers >= MIN_INLIERS and pose.keyframe in self.keyframes:
+                counts[pose.segment] = counts.get(pose.segment, 0) + 1
         return max(counts, key=counts.__getitem__, default=-1)
 
     def trajectory_in(self, segment: int, poses: dict[int, tuple[int, F64]]) -> Trajectory:
@@ -304,6 +310,8 @@ class MapHistory(CurrentMap):
         ordered = sorted(own, key=lambda keyframe: keyframe.frame)
         return {k.frame: (k.segment, k.pose_world_camera) for k in ordered}
 
-    def _world(self, pose: FramePose) -> F64:
-        keyframe = pose_to_matrix(self.keyframes[pose.keyframe].pose_world_camera)
-        return keyframe @ pose_to_matrix(pose.pose_keyframe_camera)
+    def _world(self, *frames: FramePose) -> F64:
+        """(N, 4, 4) T_world_camera of N frames whose keyframes exist."""
+        keyframes = [self.keyframes[frame.keyframe].pose_world_camera for frame in frames]
+        relative = [frame.pose_keyframe_camera for frame in frames]
+        return pose_to_matrix(np.array(keyframes)) @ pose_to_matrix(np.array(relative))
