@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
+import laspy
 import numpy as np
+import pyproj
 import pytest
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.geometry import align_umeyama, so3_exp
+from pliant.algorithms.geometry import align_umeyama, pose_to_matrix, so3_exp
 from pliant.algorithms.inertial.geodesy import EnuOrigin, enu_of, geodetic_of_enu
 from pliant.algorithms.inertial.samples import GpsFixes, ImuSamples
 from pliant.algorithms.map_delta import BY_GYRO, TRACKING
@@ -20,6 +22,8 @@ from pliant.config import Config
 from pliant.datasets.measured.fix_files import read_gpx
 from pliant.errors import ResultError
 from pliant.export.export import export_result
+from pliant.export.on_earth import write_geo_registration
+from pliant.export.posed_images import PosedImage
 from pliant.formats.tum import read_tum
 from pliant.messages import topics
 from pliant.messages.types import CameraStream, Extrema, Header, MapUpdate
@@ -34,6 +38,7 @@ from pliant_services.nodes import recorder
 EMPTY = Extrema.of(Header(frame=0, stamp_ns=0, frame_id=""), FrameTracks.empty())
 FRAMES, STEP_NS, BEGIN_NS = 400, 10**8, 1_700_000_000 * 10**9
 ORIGIN = EnuOrigin(latitude_deg=-33.9, longitude_deg=151.2, altitude_m=58.0)
+NO_POINTS = np.zeros((0, 3))
 SCALE, TURN = 3.0, so3_exp(np.array([0.4, 0.2, -1.0]))
 
 
@@ -62,9 +67,10 @@ def placed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def record(
-    folder: Path, fixes: list[Header], samples: Sequence[Header] = (), by_gyro: range = range(0)
-) -> None:
-    """by_gyro: frames that no image supports, far from where they were."""
+    folder: Path, fixes: list[Header], samples: Sequence[Header] = (), by_gyro: range = range(0),
+    points_enu: F64 = NO_POINTS,
+) -> None:  # fmt: skip
+    """by_gyro: frames that no image supports, far from where they were.    points_enu: (N, 3)."""
     stamps, enu = path()
     enu[by_gyro] += 1000.0
     camera = "model: pinhole\nwidth: 160\nheight: 120\nfx: 100\nfy: 100\ncx: 79.5\ncy: 59.5\n"
@@ -74,7 +80,7 @@ def record(
     )  # fmt: skip
     poses = np.zeros((FRAMES, 7))
     poses[:, :3], poses[:, 6] = enu @ TURN / SCALE, 1.0
-    frames, none = np.arange(FRAMES), np.zeros(FRAMES, np.int32)
+    frames, none, points = np.arange(FRAMES), np.zeros(FRAMES, np.int32), len(points_enu)
     inliers = none + 400
     inliers[by_gyro] = BY_GYRO
     final = MapUpdate(
@@ -82,10 +88,11 @@ def record(
         segment=0, inliers=400, pose_frames=frames, pose_segments=none, pose_keyframes=frames,
         poses_keyframe_camera=np.tile(np.eye(7)[6], (FRAMES, 1)), pose_inliers=inliers,
         keyframe_ids=frames, keyframe_frames=frames, keyframe_segments=none, keyframe_poses=poses,
-        point_ids=np.zeros(0, np.int64), point_segments=none[:0], points_world=np.zeros((0, 3)),
-        point_colours=np.zeros((0, 3), np.uint8), point_keyframes=none[:0],
-        point_parallax_rad=np.zeros(0, np.float32), point_sigmas=np.zeros(0, np.float32),
-        removed_point_ids=np.zeros(0, np.int64), point_hosts=np.zeros(0, np.int64),
+        point_ids=np.arange(points), point_segments=none[:points],
+        points_world=points_enu @ TURN / SCALE, point_keyframes=none[:points],
+        point_colours=np.full((points, 3), (255, 128, 0), np.uint8),
+        point_parallax_rad=np.zeros(points, np.float32), point_sigmas=np.zeros(points, np.float32),
+        removed_point_ids=np.zeros(0, np.int64), point_hosts=np.zeros(points, np.int64),
     )  # fmt: skip
     tracks = [
         dataclasses.replace(EMPTY, frame=frame, stamp_ns=int(stamp))
@@ -196,9 +203,56 @@ def test_geojson_has_the_place_of_the_map(placed: Path) -> None:
     assert told["coordinateProperties"]["times"][0] == 1_700_000_000.0
 
 
-@pytest.mark.parametrize("kind", ["gpx", "geojson"])
+def test_las_has_the_points_in_their_utm_zone(tmp_path: Path) -> None:
+    there = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 5.0], [0.0, 100.0, -2.0]])
+    record(tmp_path, list(gps_pieces(fixes_on(*path()))), points_enu=there)
+    file = export_result(tmp_path, "las", None)
+    found = laspy.read(file)
+    system = found.header.parse_crs()
+    assert system is not None
+    assert system.to_epsg() == 32756  # 151.2 degrees east, south
+    to_utm = pyproj.Transformer.from_crs(4326, 32756, always_xy=True)
+    latitude, longitude, altitude = geodetic_of_enu(there, ORIGIN)
+    expected = np.stack([*to_utm.transform(longitude, latitude), altitude], axis=1)
+    assert found.xyz == pytest.approx(expected, abs=0.02)
+    assert (found.red[0], found.green[0], found.blue[0]) == (65535, 128 * 257, 0)
+    assert str(found.header.creation_date) == "2023-11-14"
+    written = file.read_bytes()
+    assert export_result(tmp_path, "las", None, force=True).read_bytes() == written
+
+
+def test_las_without_a_map(placed: Path) -> None:
+    with pytest.raises(ResultError, match="no map to export"):
+        export_result(placed, "las", None)
+
+
+@pytest.mark.parametrize("kind", ["gpx", "geojson", "las"])
 def test_without_fixes_there_is_no_track(tmp_path: Path, kind: str) -> None:
     record(tmp_path, [])
     with pytest.raises(ResultError, match="had no satellite fixes"):
         export_result(tmp_path, kind, None)
-    assert not (tmp_path / f"track.{kind}").exists()
+    assert not list(tmp_path.glob(f"*.{kind}"))
+
+
+def test_images_of_a_colmap_model_have_their_place_on_the_earth(tmp_path: Path) -> None:
+    """A line for each image; no file where the source has no fixes."""
+    stamps, enu = path()
+    record(tmp_path, list(gps_pieces(fixes_on(stamps, enu))))
+    recording = MetricRecording(tmp_path / "recording.mcap")
+    run = read_run(recording.path)
+    images = [
+        PosedImage(frame, pose_to_matrix(pose)) for frame, (_, pose) in run.history.final().items()
+    ]
+    file = tmp_path / "geo_registration.txt"
+    write_geo_registration(recording, run, file, images)
+    rows = [line.split() for line in file.read_text().splitlines()]
+    assert [row[0] for row in rows] == [image.name for image in images]
+    latitude, longitude, altitude = np.array([row[1:] for row in rows], np.float64).T
+    assert enu_of(latitude, longitude, altitude, ORIGIN) == pytest.approx(enu, abs=0.01)
+    unplaced = tmp_path / "unplaced"
+    unplaced.mkdir()
+    record(unplaced, [])
+    without = MetricRecording(unplaced / "recording.mcap")
+    none = tmp_path / "none.txt"
+    write_geo_registration(without, read_run(without.path), none, images)
+    assert not none.exists()

@@ -14,6 +14,7 @@ from pliant.algorithms.geometry import inverse
 from pliant.algorithms.slam.locate.reacquisition import MaximaGrid
 from pliant.export.crop import Box
 from pliant.export.images import camera_of, make_folder
+from pliant.export.on_earth import write_geo_registration
 from pliant.export.posed_images import (
     INLIER_PX,
     IdealCamera,
@@ -33,7 +34,7 @@ _SAME_PX = 0.1  # of a track that was observed, but for rounding
 
 def colmap(recording: Recording, path: Path, folder: Path | None) -> None:
     """``sparse/0`` with the text model, ``images`` as its camera sees them, and where there are
-    masks ``masks`` as COLMAP names them."""
+    masks ``masks`` as COLMAP names them.  ``geo_registration.txt`` where fixes place the map."""
     run = read_run(recording.path)
     ideal = IdealCamera(run)
     images = write_posed_images(
@@ -44,6 +45,7 @@ def colmap(recording: Recording, path: Path, folder: Path | None) -> None:
     make_folder(path / MODEL)
     colours = np.asarray(points.colours[kept], np.uint8)
     write_colmap(path / MODEL, ideal.camera, model, points.positions[kept], colours)
+    write_geo_registration(recording, run, path / "geo_registration.txt", images)
 
 
 def mask_name(name: str) -> str:

@@ -18,7 +18,7 @@ from pliant.export.images import camera_of, images, rectified_images
 from pliant.export.kinds import KINDS, OF_STILL_SCENES, OPTIONS
 from pliant.export.models import foxglove, ply, rerun, solid
 from pliant.export.nerfstudio import nerfstudio
-from pliant.export.on_earth import geojson, gpx
+from pliant.export.on_earth import geojson, gpx, las
 from pliant.export.overview import (
     FPS,
     FRAMES,
@@ -311,6 +311,7 @@ _WRITERS: dict[str, Export] = {
     "euroc": _poses(write_euroc),
     "gpx": gpx,
     "geojson": geojson,
+    "las": las,
     "ply": ply,
     "colmap": colmap,
     "nerfstudio": nerfstudio,
@@ -330,5 +331,5 @@ _WRITERS: dict[str, Export] = {
 }
 EXPORTS = {kind: (name, _WRITERS[kind]) for kind, name in KINDS.items()}
 """Kind of export: its default name, and who writes it."""
-_NAMED = ("foxglove", "rerun", "gpx", "geojson", "ply", "glb", "watertight", "animation")
+_NAMED = ("foxglove", "rerun", "gpx", "geojson", "las", "ply", "glb", "watertight", "animation")
 """Kinds that other programs know by the ending; trajectories are text under any."""

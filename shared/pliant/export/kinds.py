@@ -8,6 +8,7 @@ KINDS = {
     "euroc": "trajectory_euroc.csv",
     "gpx": "track.gpx",
     "geojson": "track.geojson",
+    "las": "surface.las",
     "ply": "points_longest.ply",
     "colmap": "colmap",
     "nerfstudio": "nerfstudio",
@@ -30,6 +31,7 @@ KINDS = {
 OF_STILL_SCENES = (
     "gpx",
     "geojson",
+    "las",
     "ply",
     "colmap",
     "nerfstudio",
@@ -47,6 +49,6 @@ OPTIONS = {
     "triangles": ("glb", "obj"),
     "clean": ("glb", "obj"),
     "observed": ("glb", "obj"),
-    "crop": ("glb", "obj", "watertight", "ply", "splat"),
+    "crop": ("glb", "obj", "watertight", "ply", "splat", "las"),
 }
 """Which kinds have an option."""
