@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from test_map_history import IDENTITY, nothing
+from map_updates import IDENTITY, nothing
 
 from pliant.algorithms.arrays import F32, F64
 from pliant.algorithms.camera import PinholeCamera
@@ -62,7 +62,7 @@ def test_the_motion_is_that_between_the_frames_beside(frames: tuple[int, ...]) -
     np.testing.assert_allclose(found, [*OMEGA, *NU], rtol=0.05, atol=1e-3)
 
 
-def test_frames_elsewhere_or_without_support_tell_no_motion() -> None:
+def test_there_is_no_motion_without_supported_frames_beside() -> None:
     assert motion(told((8, 10, 12))) is None
     assert motion(told((9, 11), inliers=5)) is None
 
