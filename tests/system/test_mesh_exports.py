@@ -10,6 +10,7 @@ import pytest
 from running import assert_one_line, in_this_process
 
 from pliant import open3d_library
+from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.meshing.rendering import view_mesh
 from pliant.errors import ResultError
 from pliant.export.crop import Box
@@ -48,8 +49,10 @@ def test_a_textured_mesh_has_the_colours_that_its_keyframes_show(
     run = read_run(recording.path)
     assert run.stream is not None
     images = list(keyframe_images(recording, run, run.history.longest_segment()))
+    poses = run.history.keyframe_poses()
     assert len(images) > 4
-    for T_world_camera, image, _ in images[:: len(images) // 3]:
+    for frame, image, _ in images[:: len(images) // 3]:
+        T_world_camera = pose_to_matrix(poses[frame][1])
         seen = view_mesh(mesh.positions, mesh.triangles, run.stream.camera, T_world_camera)
         at = seen.interpolate(mesh.triangles, mesh.uvs) * np.float32(len(mesh.texture)) - 0.5
         drawn = cv2.remap(mesh.texture, at[..., 0], at[..., 1], cv2.INTER_LINEAR)

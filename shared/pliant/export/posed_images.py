@@ -9,7 +9,7 @@ masked.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -17,12 +17,9 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8, BoolArray
-from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.image.duplicate_views import SHARPER
 from pliant.algorithms.image.masks import mask_image
 from pliant.algorithms.image.sharpness import sharpness
-from pliant.algorithms.slam.calibration.corrected_view import corrected_view
-from pliant.algorithms.slam.calibration.rolling_shutter import RolledFrame, motion_between
 from pliant.errors import ResultError
 from pliant.export.images import (
     RectifiedImage,
@@ -35,6 +32,7 @@ from pliant.export.images import (
 from pliant.messages.types import CameraStream
 from pliant.recording.reader import Recording
 from pliant.results.run import Run
+from pliant.results.still_frames import StillFrames
 
 INLIER_PX = 1.5
 """The mapper's limit."""
@@ -68,46 +66,29 @@ class IdealCamera:
     def __init__(self, run: Run) -> None:
         """Raises ResultError where there is no map."""
         self.segment = run.history.longest_segment()
-        poses = {**run.history.final(), **run.history.keyframe_poses()}
-        self.poses = {f: pose_to_matrix(p) for f, (s, p) in poses.items() if s == self.segment}
+        if run.stream is None:
+            raise ResultError("the run has no map to export")
+        self._still = StillFrames(run, run.stream.camera, self.segment)
+        self.poses = self._still.poses
         own = {k.frame: number for number, k in run.history.keyframes.items()}
         self.keyframes = {f: number for f, number in sorted(own.items()) if f in self.poses}
-        if run.stream is None or not self.keyframes:
+        if not self.keyframes:
             raise ResultError("the run has no map to export")
-        correction = run.correction_of(self.segment)
-        self._readout = correction[3] if len(correction) > 3 else 0.0
-        view = corrected_view(run.stream.camera, correction)
-        self._whole, self._view = view, ShownView(view)
+        self._view = ShownView(self._still.view)
         self.camera = self._view.camera
-        self._positions = run.history.points_in(self.segment).positions
-        self._rolled = lru_cache(maxsize=1)(self._rolled_frame)
 
     def image(self, frame: int, pixels: U8) -> U8:
         """(h, w) or (h, w, 3) of the rectified image of a frame that has a pose."""
-        return self._view.image(pixels, self._rolled(frame))
+        return self._view.image(pixels, self._still.rolled(frame))
 
     def pixels(self, frame: int, points_px: F32) -> F32:
         """(N, 2) where ``image`` shows what the rectified image of the frame shows there."""
-        return self._view.pixels(points_px, self._rolled(frame))
+        return self._view.pixels(points_px, self._still.rolled(frame))
 
     def shows(self, points_px: F64) -> BoolArray:
         """(N,) which of the pixels (N, 2) lie in the image."""
         size = (self.camera.width - 0.5, self.camera.height - 0.5)
         return np.all((points_px > -0.5) & (points_px < size), axis=1)
-
-    def _rolled_frame(self, frame: int) -> RolledFrame | None:
-        """By the motion between the frames around it, at the median depth of what it sees."""
-        near = [f for f in (frame - 1, frame, frame + 1) if f in self.poses]
-        if not self._readout or len(near) < 2:
-            return None
-        T = self.poses[frame]
-        first, last = self.poses[near[0]], self.poses[near[-1]]
-        motion = motion_between(first, last, T) / (near[-1] - near[0])
-        local = (self._positions - T[:3, 3]) @ T[:3, :3]
-        local = local[local[:, 2] > 0.0]
-        depths = local[self.shows(self.camera.project(local)), 2]
-        inverse_depth = float(1.0 / np.median(depths)) if len(depths) else 0.0
-        return RolledFrame(self._whole, self._readout, motion, inverse_depth)
 
 
 def write_posed_images(

@@ -1,6 +1,7 @@
 """A keyframe's image and mask, in the pixels of the ideal camera."""
 
 from functools import lru_cache
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -9,6 +10,10 @@ from pliant.algorithms.arrays import U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.image.masks import unpacked
 from pliant.algorithms.slam.calibration.corrected_view import CorrectedView
+from pliant.algorithms.slam.calibration.rolling_shutter import RolledFrame
+
+View: TypeAlias = CorrectedView | RolledFrame
+"""The second removes a rolling shutter, too."""
 
 
 @lru_cache(maxsize=4)
@@ -17,7 +22,7 @@ def view_of(camera: PinholeCamera, correction: tuple[float, ...]) -> CorrectedVi
     return CorrectedView(camera, correction)
 
 
-def colour_of(jpeg: bytes, view: CorrectedView) -> U8 | None:
+def colour_of(jpeg: bytes, view: View) -> U8 | None:
     """(H, W, 3) RGB; None where the image is missing or broken."""
     if not jpeg:
         return None
@@ -32,7 +37,7 @@ def grey_of(colour: U8) -> U8:
     return np.asarray(cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def unmasked(mask: bytes, view: CorrectedView) -> BoolArray | None:
+def unmasked(mask: bytes, view: View) -> BoolArray | None:
     """(H, W) what the mask of an image leaves; None: all, where there is none."""
     if not mask:
         return None

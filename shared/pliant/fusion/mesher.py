@@ -22,11 +22,17 @@ from pliant.algorithms.meshing.mesh_blocks import MeshBlocks, TriangleMesh
 from pliant.algorithms.meshing.parameters import MeshingParameters
 from pliant.algorithms.meshing.rendering import DepthMap
 from pliant.algorithms.meshing.tsdf_volume import VolumeFullError
-from pliant.algorithms.slam.calibration.corrected_view import corrected_view, parts_of
+from pliant.algorithms.slam.calibration.corrected_view import (
+    CorrectedView,
+    corrected_view,
+    parts_of,
+)
+from pliant.algorithms.slam.calibration.rolling_shutter import RolledFrame
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.fusion.dense_depth import FINAL, LIVE, DenseDepths, Detail
 from pliant.fusion.final_volume import FinalVolume
-from pliant.fusion.keyframe_images import colour_of, grey_of, unmasked, view_of
+from pliant.fusion.keyframe_images import View, colour_of, grey_of, unmasked, view_of
+from pliant.fusion.keyframe_motions import KeyframeMotions
 from pliant.fusion.keyframe_spool import KeyframeSpool
 from pliant.fusion.live_mesh import LiveMesh, Sight
 from pliant.fusion.memory import too_fine
@@ -75,7 +81,9 @@ class Mesher:
         self._parameters = parameters
         self._spool = spool
         self._map = CurrentMap()
+        self._motions = KeyframeMotions()
         self._corrections: dict[int, tuple[float, ...]] = {}
+        self._readouts: dict[int, float] = {}
         self._surfaces = KeyframeSurfaces(camera, parameters.surface)
         self._live_dense = self._dense_depths(LIVE)
         self._live: LiveMesh | None = None
@@ -105,6 +113,7 @@ class Mesher:
         one, as of ``algorithms.image.masks``: what they cover is no surface.
         """
         self._map.take(update, frame)
+        self._motions.take(update)
         if len(update.moved_keyframes):
             self._has_moved = True
             self._live_dense.move(update.map_moves())
@@ -154,6 +163,7 @@ class Mesher:
         left = self._left_of(correction)
         self._has_moved |= left != self._corrections.get(segment, left)
         self._corrections[segment] = left
+        self._readouts[segment] = correction[3] if len(correction) > 3 else 0.0
 
     def _left_of(self, correction: tuple[float, ...]) -> tuple[float, ...]:
         """The rest of a correction relative to the frozen pinhole."""
@@ -243,7 +253,7 @@ class Mesher:
             self._pass_over(keyframe, surface.problem or _NO_IMAGE)
             return
         self._spool.put_surface(keyframe, surface.drawn)
-        depth_map = self._within(keyframe, surface.depth_map, correction)
+        depth_map = self._within(keyframe, surface.depth_map, view_of(self._camera, correction))
         sight = Sight(depth_map, colour, self._pose(keyframe))
         tsdf = self._parameters.tsdf
         try:
@@ -292,7 +302,8 @@ class Mesher:
             colour = self._colour(keyframe, old.correction)
         assert colour is not None
         depth_map = self._spool.surface(keyframe).depth_map(self._camera)
-        live.take_out(keyframe, self._within(keyframe, depth_map, old.correction), colour)
+        view = view_of(self._camera, old.correction)
+        live.take_out(keyframe, self._within(keyframe, depth_map, view), colour)
 
     def _finish_segment(
         self, segment: int, keyframes: list[int], timer: StageTimer, held: ExitStack
@@ -309,8 +320,8 @@ class Mesher:
         fused, problem = 0, ""
         agreements = dense.agreed(keyframes, timer)
         for keyframe, agreed in zip(keyframes, agreements, strict=True):
-            correction, pose = self._correction(keyframe), self._pose(keyframe)
-            colour = self._colour(keyframe, correction)
+            view, pose = self._still(keyframe), self._pose(keyframe)
+            colour = colour_of(self._spool.image(keyframe), view)
             seen = dense.with_sure_pixels(keyframe, self._seen(keyframe), agreed)
             surface = self._surfaces.surface(pose, seen, timer)
             if surface.depth_map is None or colour is None:
@@ -318,7 +329,7 @@ class Mesher:
                 continue
             with timer("dense filling"):
                 depth_map = dense.filled(keyframe, surface.depth_map, agreed)
-            depth_map = self._within(keyframe, depth_map, correction)
+            depth_map = self._within(keyframe, depth_map, view)
             for level, volume in volumes.items():
                 with timer(f"final {level} fusion"):
                     volume.put(depth_map, colour, pose)
@@ -360,7 +371,7 @@ class Mesher:
     def _take_dense(self, dense: DenseDepths, keyframe: int, timer: StageTimer) -> None:
         """Give the image of a keyframe to be swept; nothing where it has none."""
         with timer("dense images"):
-            view = view_of(self._camera, self._correction(keyframe))
+            view = self._still(keyframe)
             colour = colour_of(self._spool.image(keyframe), view)
             if colour is None:
                 return
@@ -373,19 +384,15 @@ class Mesher:
         """Median over the keyframes of the median depth of their points."""
         medians: list[float] = []
         for keyframe in keyframes:
-            T = self._pose(keyframe)
-            points = self._seen(keyframe).points_world
-            depths = (points - T[:3, 3]) @ T[:3, 2]
+            depths = self._depths(keyframe, self._seen(keyframe).points_world)
             depths = depths[np.isfinite(depths) & (depths > 0.0)]
             if len(depths):
                 medians.append(float(np.median(depths)))
         return float(np.median(medians)) if medians else 1.0
 
-    def _within(
-        self, keyframe: int, depth_map: DepthMap, correction: tuple[float, ...]
-    ) -> DepthMap:
+    def _within(self, keyframe: int, depth_map: DepthMap, view: View) -> DepthMap:
         """The depth map without the pixels that the keyframe's mask covers."""
-        used = unmasked(self._spool.mask(keyframe), view_of(self._camera, correction))
+        used = unmasked(self._spool.mask(keyframe), view)
         return depth_map if used is None else depth_map.within(used)
 
     def _correction(self, keyframe: int) -> tuple[float, ...]:
@@ -396,13 +403,37 @@ class Mesher:
     def _pose(self, keyframe: int) -> F64:
         return pose_to_matrix(self._map.keyframes[keyframe].pose_world_camera)
 
+    def _depths(self, keyframe: int, points_world: F64) -> F64:
+        T = self._pose(keyframe)
+        return (points_world - T[:3, 3]) @ T[:3, 2]
+
+    def _still(self, keyframe: int) -> View:
+        """What a keyframe would see with a global shutter, at the depth of its points."""
+        view = view_of(self._camera, self._correction(keyframe))
+        readout = self._readouts.get(self._map.keyframes[keyframe].segment, 0.0)
+        motion = self._motions.motion(keyframe, self._map.keyframes) if readout else None
+        if motion is None:
+            return view
+        _, points = self._map.points_of(self._spool.observations(keyframe)[0])
+        depths = self._depths(keyframe, points.positions)
+        depths = depths[depths > 0.0]
+        inverse_depth = float(1.0 / np.median(depths)) if len(depths) else 0.0
+        return RolledFrame(view, readout, motion, inverse_depth)
+
     def _seen(self, keyframe: int) -> SeenPoints:
         """The points that a keyframe observes, without those that are gone."""
         ids, pixels = self._spool.observations(keyframe)
         rows, points = self._map.points_of(ids)
+        view = self._still(keyframe)
+        if isinstance(view, CorrectedView):
+            points_px = view.pixels(pixels[rows])
+        else:
+            with np.errstate(divide="ignore"):
+                inverse_depths = 1.0 / self._depths(keyframe, points.positions)
+            points_px = view.removed(view.view.pixels(pixels[rows]), inverse_depths)
         return SeenPoints(
             ids=points.ids,
-            points_px=view_of(self._camera, self._correction(keyframe)).pixels(pixels[rows]),
+            points_px=points_px,
             points_world=points.positions,
             sigmas=np.asarray(points.sigmas, np.float32),
             keyframes=np.asarray(points.keyframes, np.int32),

@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, U8, BoolArray
-from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.image.masks import mask_image, unpacked
 from pliant.algorithms.image.sharpness import sharpness
 from pliant.algorithms.meshing.decimation import decimated
@@ -20,12 +19,12 @@ from pliant.algorithms.meshing.texturing import (
     patches,
 )
 from pliant.algorithms.meshing.view_exposure import ExposureSamples
-from pliant.algorithms.slam.calibration.corrected_view import corrected_view
 from pliant.formats.textured import TexturedMesh
 from pliant.messages import topics
 from pliant.messages.types import CameraStream, Keyframe
 from pliant.recording.reader import Recording
 from pliant.results.run import Run
+from pliant.results.still_frames import StillFrames
 
 _EXPOSURE_SAMPLES = 4096
 """Places on the mesh by whose colours keyframes are compared."""
@@ -46,13 +45,14 @@ def textured(
     uvs = make_atlas(points[faces], cut, texels)
     on_mesh = find_texels(uvs, texels)
     shown = TexelColours(on_mesh, points, faces)
-    view = corrected_view(stream.camera, run.correction_of(segment))
-    camera = view.camera
+    still = StillFrames(run, stream.camera, segment)
+    camera = still.view.camera
     at = np.linspace(0, len(shown.positions) - 1, _EXPOSURE_SAMPLES).astype(np.int64)
     exposures = ExposureSamples(shown.positions[at], shown.normals[at])
 
     def seen() -> Iterator[tuple[F64, U8, F32]]:
-        for T_world_camera, image, used in keyframe_images(recording, run, segment, views):
+        for frame, image, used in keyframe_images(recording, run, segment, views):
+            T_world_camera, view = still.poses[frame], still.rolled(frame) or still.view
             mask = None if used is None else mask_image(used, view.image) > 0
             yield T_world_camera, view.image(image), shown.depths(camera, T_world_camera, mask)
 
@@ -69,12 +69,13 @@ def textured(
 
 def keyframe_images(
     recording: Recording, run: Run, segment: int, most: int | None = None
-) -> Iterator[tuple[F64, U8, BoolArray | None]]:
-    """Final pose, (H, W, 3) image and mask (H, W) of each keyframe of a segment that has one.
+) -> Iterator[tuple[int, U8, BoolArray | None]]:
+    """Frame, (H, W, 3) image and mask (H, W) of each keyframe of a segment that has an image.
 
     most: of at most this many of its keyframes, spread over all; None: of all.
     """
-    here = sorted(n for n, known in run.history.keyframes.items() if known.segment == segment)
+    frames = {n: k.frame for n, k in run.history.keyframes.items() if k.segment == segment}
+    here = sorted(frames)
     wanted = set(here[:: max(1, -(-len(here) // most))] if most else here)
     for topic in (topics.KEYFRAME, topics.KEYFRAME_FINAL):
         for message in recording.decoded(topic):
@@ -86,8 +87,7 @@ def keyframe_images(
                 image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
                 if image is not None:
                     used = unpacked(masks[number]) if number in masks else None
-                    pose = pose_to_matrix(run.history.keyframes[number].pose_world_camera)
-                    yield pose, np.asarray(image, np.uint8), used
+                    yield frames[number], np.asarray(image, np.uint8), used
 
 
 def _with_texture(points: F32, faces: I32, uvs: F32, texture: U8) -> TexturedMesh:

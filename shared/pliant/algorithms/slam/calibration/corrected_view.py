@@ -78,9 +78,7 @@ class CorrectedView:
     def shows(self) -> BoolArray:
         """(H, W) which pixels of the ideal image have their centre within the rectified one: the
         others are made up of its border."""
-        u, v = self._places
-        width, height = self.camera.width, self.camera.height
-        return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
+        return shows(self._places)
 
     @cached_property
     def _places(self) -> Move:
@@ -113,6 +111,13 @@ def moved_px(
     """
     seen = before.seen(points_px)
     return after.pixels(seen if log_factors is None else after.magnified(seen, -log_factors))
+
+
+def shows(move: Move) -> BoolArray:
+    """(H, W) which pixels of a moved image have their centre within the one before, of its size."""
+    u, v = move
+    height, width = u.shape
+    return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
 
 
 def parts_of(correction: tuple[float, ...]) -> tuple[float, float, float, float, float, float]:

@@ -21,12 +21,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, U8
+from pliant.algorithms.arrays import F32, F64, I32, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log
 from pliant.algorithms.image.moved_image import Move, moved_image
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.slam.calibration.corrected_view import CorrectedView
+from pliant.algorithms.slam.calibration.corrected_view import CorrectedView, shows
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.compiler.kernel import fast_kernel, kernel
 
@@ -212,6 +212,11 @@ class RolledFrame:
         one depth.
         """
         return moved_image(pixels, self.places)
+
+    @property
+    def shows(self) -> BoolArray:
+        """(H, W) as of ``CorrectedView.shows``."""
+        return shows(self.places)
 
     @cached_property
     def places(self) -> Move:
