@@ -28,7 +28,8 @@ A Gauss-Newton step eliminates the landmarks without making the matrix that resu
 
     S = H - sum_i W_i H_i^-1 W_i^T,
 
-by conjugate gradients.  H has one dense block for each keyframe, whose inverse preconditions.
+by conjugate gradients.  H has one dense block for each keyframe, whose inverse preconditions; it is
+made anew in every third step.
 """
 
 from dataclasses import dataclass
@@ -63,6 +64,8 @@ _REGULAR = 1e-6
 _HELD = 1e12
 """Damping of the first camera, which is the world."""
 _RIGID_STEPS, _STEPS = 4, 12
+_INVERTED_EVERY = 3
+"""Steps with the same inverses of the blocks."""
 _TOLERANCE, _PRODUCTS = 1e-2, 80
 """Of conjugate gradients."""
 
@@ -160,6 +163,7 @@ class _Adjustment:
         self._tracks, self._intrinsics, self._graph = tracks, camera.intrinsics, graph
         self._prior = Prior(graph)
         self._damping = _FIRST_DAMPING
+        self._inverse = np.zeros((0, 0, 0))
 
     def minimised(self, state: _State, steps: int) -> _State:
         """Try this many steps; each that decreases the cost is taken.
@@ -167,8 +171,8 @@ class _Adjustment:
         The unit is kept: otherwise the map would shrink, and its displacements with it.
         """
         now, distance = self.linearised(state), _distance(state)
-        for _ in range(steps):
-            moved = self._stepped(state, now)
+        for step in range(steps):
+            moved = self._stepped(state, now, step % _INVERTED_EVERY == 0)
             moved = _scaled(moved, distance / _distance(moved))
             then = self.linearised(moved)
             if then.cost + self._prior_cost(moved) < now.cost + self._prior_cost(state):
@@ -207,7 +211,7 @@ class _Adjustment:
     def _prior_cost(self, state: _State) -> float:
         return float(np.vdot(state.d, self._prior.gradient(state.d)))
 
-    def _stepped(self, state: _State, now: _Linearised) -> _State:
+    def _stepped(self, state: _State, now: _Linearised, inverting: bool) -> _State:
         """One step: landmarks eliminated, the rest by conjugate gradients."""
         t, graph = self._tracks, self._graph
         table = (t.keyframes, t.landmarks, graph.carriers, graph.weights, now.J_camera, now.J_point)
@@ -242,10 +246,11 @@ class _Adjustment:
         b = -g
         times_transposed(*table, np.zeros((len(t.keyframes), 2)), of_points(-g_point), b)
         # b = -(g - W H^-1 g_point): the kernel subtracts J_point x, so x is -H^-1 g_point.
-        inverse = np.linalg.inv(H)
+        if inverting:
+            self._inverse = np.asarray(np.linalg.inv(H), np.float64)
 
         def precondition(v: F64) -> F64:
-            return np.einsum("kab,kb->ka", inverse, v)
+            return np.einsum("kab,kb->ka", self._inverse, v)
 
         x = conjugate_gradients(product, precondition, b, tolerance=_TOLERANCE, limit=_PRODUCTS)
         u, by_point = np.empty((len(t.keyframes), 2)), np.zeros((L, 3))

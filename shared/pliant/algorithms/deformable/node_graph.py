@@ -28,7 +28,7 @@ class NodeGraph:
     spacing: float
 
 
-_MOST = 150
+_MOST = 100
 """Nodes; a larger scene has them farther apart."""
 
 
