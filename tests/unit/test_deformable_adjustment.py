@@ -7,6 +7,7 @@ from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.deformable.adjustment import adjust_deforming
 from pliant.algorithms.deformable.conjugate_gradients import conjugate_gradients
+from pliant.algorithms.deformable.held_out import triangulate, weigh
 from pliant.algorithms.deformable.linearised import (
     CAMERA,
     accumulate,
@@ -136,6 +137,39 @@ def test_tracks_without_parallax_are_not_reliable() -> None:
     rows = np.flatnonzero(np.abs(points[0, :, 0]) < 0.2)
     found = adjust_deforming(tracked(points[:, rows], T), T, CAMERA_640)
     assert found.reliable.mean() < 0.1
+
+
+def test_held_out_tracks_are_predicted_by_the_map_that_moves() -> None:
+    points, T = breathing(0.018)
+    mine, others = tracked(points[:, ::2], T), tracked(points[:, 1::2], T)
+    found = adjust_deforming(mine, disturbed(T), CAMERA_640)
+    evidence = weigh(found, others, CAMERA_640)
+    assert evidence.predicted > 0.98
+    assert evidence.by_rigid < 0.95
+    assert evidence.gain > 0.5
+    assert 0.5 < evidence.stiff < 0.9
+    wrong = TrackedPoints(
+        keyframes=others.keyframes,
+        landmarks=others.landmarks,
+        points_px=others.points_px[::-1],
+    )
+    assert weigh(found, wrong, CAMERA_640).predicted < 0.1
+
+
+def test_rigid_tracks_are_predicted_as_well_without_displacements() -> None:
+    points, T = breathing(0.0)
+    mine, others = tracked(points[:, ::2], T), tracked(points[:, 1::2], T)
+    evidence = weigh(adjust_deforming(mine, disturbed(T), CAMERA_640), others, CAMERA_640)
+    assert evidence.predicted == evidence.by_rigid == evidence.stiff == 1.0
+    assert evidence.gain < 0.1
+
+
+def test_triangulation() -> None:
+    rng = np.random.default_rng(6)
+    points, centres = rng.uniform(1.0, 2.0, (5, 3)), rng.uniform(-1.0, 0.0, (5, 4, 3))
+    rays = (points[:, None] - centres) * rng.uniform(0.5, 2.0, (5, 4, 1))
+    found = triangulate(np.repeat(np.arange(5), 4), rays.reshape(-1, 3), centres.reshape(-1, 3), 5)
+    np.testing.assert_allclose(found, points, atol=1e-6)
 
 
 def test_too_few_landmarks_are_refused() -> None:

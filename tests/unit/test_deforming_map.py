@@ -7,13 +7,14 @@ import pytest
 
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.deformable.held_out import Evidence
 from pliant.algorithms.geometry import inverse, matrix_to_pose, so3_exp, transform
 from pliant.evaluation.deforming_map_truth import format_deforming_map, judge_deforming_map
 from pliant.evaluation.surface_truth import MaterialPoints, SurfaceTruth
 from pliant.formats.tum import write_tum
 from pliant.map_history import FramePose, Keyframe, MapHistory
 from pliant.rendering.deforming_scenes import BreathingOptions, deforming_scene
-from pliant.results.deforming_map import adjust_and_write
+from pliant.results.deforming_map import adjust_and_write, doubt
 from pliant.trajectory import Trajectory
 
 CAMERA = PinholeCamera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
@@ -35,14 +36,20 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> SurfaceTruth:
     return SurfaceTruth(folder, CAMERA)
 
 
-def tracks(truth: SurfaceTruth) -> list[tuple[int, I64, F64]]:
-    """Material points in view, to a fifth of a pixel."""
+def tracks(
+    truth: SurfaceTruth, *, rigid: bool = False, still: bool = False
+) -> list[tuple[int, I64, F64]]:
+    """Material points in view, to a fifth of a pixel.
+
+    rigid: those of the first frame.    still: as the first camera sees them.
+    """
     rng = np.random.default_rng(8)
     where = rng.uniform((20.0, 20.0), (130.0, 100.0), (1500, 2))
     points = MaterialPoints(np.zeros(len(where), np.int32), where)
     out: list[tuple[int, I64, F64]] = []
     for frame in range(len(truth)):
-        seen = transform(inverse(truth.T_world_camera[frame]), truth.positions(points, frame))
+        shape = truth.positions(points, 0 if rigid else frame)
+        seen = transform(inverse(truth.T_world_camera[0 if still else frame]), shape)
         pixels = CAMERA.project(seen) + 0.2 * rng.standard_normal((len(seen), 2))
         inside = ((pixels > 0.0) & (pixels < (639.0, 479.0))).all(axis=1)
         out.append((frame, np.flatnonzero(inside), pixels[inside]))
@@ -92,7 +99,7 @@ def test_breathing_within_the_targets(truth: SurfaceTruth, tmp_path: Path) -> No
 
 
 def test_equal_tracks_give_equal_bytes(truth: SurfaceTruth, tmp_path: Path) -> None:
-    some = [(frame, ids[::4], pixels[::4]) for frame, ids, pixels in tracks(truth)]
+    some = [(frame, ids[::2], pixels[::2]) for frame, ids, pixels in tracks(truth)]
     files = [tmp_path / f"{number}.npz" for number in range(2)]
     for file in files:
         assert not adjust_and_write(file, rigid_map(truth), CAMERA, some)
@@ -109,10 +116,42 @@ def test_tracks_that_end_at_once_make_no_map(truth: SurfaceTruth, tmp_path: Path
     assert not file.exists()
 
 
-def test_landmarks_that_nothing_determines_make_no_map(truth: SurfaceTruth, tmp_path: Path) -> None:
-    """Pixels by chance: none fits."""
+def test_a_rigid_scene_has_none(truth: SurfaceTruth, tmp_path: Path) -> None:
+    file = tmp_path / "deforming_map.npz"
+    why = adjust_and_write(file, rigid_map(truth), CAMERA, tracks(truth, rigid=True))
+    assert why == "a rigid map predicts its tracks as well, or nearly so"
+    assert not file.exists()
+
+
+def test_a_camera_that_stands_still_determines_none(truth: SurfaceTruth, tmp_path: Path) -> None:
+    """The rigid map takes the breathing for a motion of the camera."""
+    file = tmp_path / "deforming_map.npz"
+    why = adjust_and_write(file, rigid_map(truth), CAMERA, tracks(truth, still=True))
+    assert "of its landmarks are certain" in why
+    assert not file.exists()
+
+
+def test_pixels_by_chance_determine_none(truth: SurfaceTruth, tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     chance = [(f, ids, generator.uniform(0.0, 200.0, px.shape)) for f, ids, px in tracks(truth)]
     file = tmp_path / "deforming_map.npz"
-    assert adjust_and_write(file, rigid_map(truth), CAMERA, chance) == "no landmark is reliable"
+    why = adjust_and_write(file, rigid_map(truth), CAMERA, chance)
+    assert why == "only 0% of its landmarks are certain"
     assert not file.exists()
+
+
+@pytest.mark.parametrize(
+    ("certain", "evidence", "why"),
+    [
+        (0.8, Evidence(0.99, 0.95, 0.7, 0.8), ""),
+        (0.4, Evidence(0.99, 0.95, 0.7, 0.8), "only 40% of its landmarks are certain"),
+        (0.8, Evidence(0.75, 0.50, 0.7, 0.8), "only 75% of the tracks"),
+        (0.8, Evidence(0.99, 0.99, 0.0, 1.0), "a rigid map predicts its tracks as well"),
+        (0.8, Evidence(0.99, 0.95, 0.7, 0.2), "only 20% of its landmarks hardly move"),
+        (0.8, Evidence(float("nan"), 0.95, 0.7, 0.8), "only nan% of the tracks"),
+    ],
+)
+def test_each_doubt_has_its_reason(certain: float, evidence: Evidence, why: str) -> None:
+    found = doubt(certain, evidence)
+    assert why in found
+    assert bool(found) == bool(why)

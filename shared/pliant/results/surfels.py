@@ -98,7 +98,7 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
                     surface.take(surfels)
         write_tum(folder / TRAJECTORY_NAME, _trajectory(followed))
         report = _report(run, counts, len(followed))
-        if recorded_config(run.recorded.metadata, []).surfels.final_map:
+        if _moves_on_own_map(run.recorded.metadata):
             report["deforming_map"] = write_deforming_map(
                 folder / DEFORMING_MAP_NAME, recording, run
             )
@@ -226,6 +226,11 @@ def _depth_from(metadata: Mapping[str, Mapping[str, str]]) -> str:
     if "config" not in metadata:
         return ""
     return recorded_config(metadata, []).surfels.depth_from
+
+
+def _moves_on_own_map(metadata: Mapping[str, Mapping[str, str]]) -> bool:
+    """Whether a map that deforms can be made at the end."""
+    return _depth_from(metadata) == "map" and not _stands_still(metadata)
 
 
 def _stands_still(metadata: Mapping[str, Mapping[str, str]]) -> bool:

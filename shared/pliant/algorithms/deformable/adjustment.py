@@ -28,7 +28,8 @@ A Gauss-Newton step eliminates the landmarks without making the matrix that resu
 
     S = H - sum_i W_i H_i^-1 W_i^T,
 
-by conjugate gradients.  H has one dense block for each keyframe, whose inverse preconditions.
+by conjugate gradients.  H has one dense block for each keyframe, whose inverse preconditions; it is
+made anew in every third step.
 """
 
 from dataclasses import dataclass
@@ -38,6 +39,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.deformable.conjugate_gradients import conjugate_gradients
+from pliant.algorithms.deformable.held_out import KERNEL_PX, triangulate
 from pliant.algorithms.deformable.linearised import (
     CAMERA,
     accumulate,
@@ -52,8 +54,6 @@ from pliant.algorithms.geometry import so3_exp
 
 _NOISE_PX = 0.5
 """Standard deviation of a track."""
-_KERNEL_PX = 1.5
-"""Of the Cauchy kernel."""
 _SPACING = 0.2
 """Between nodes, as a share of the median depth."""
 _CERTAIN = 0.01
@@ -64,6 +64,8 @@ _REGULAR = 1e-6
 _HELD = 1e12
 """Damping of the first camera, which is the world."""
 _RIGID_STEPS, _STEPS = 4, 12
+_INVERTED_EVERY = 3
+"""Steps with the same inverses of the blocks."""
 _TOLERANCE, _PRODUCTS = 1e-2, 80
 """Of conjugate gradients."""
 
@@ -102,14 +104,16 @@ def adjust_deforming(
     none = np.zeros((len(T_start), 0, 3))
     rigid = _Adjustment(tracks, camera, no_nodes(len(rest)))
     state = rigid.minimised(_State(T_start, rest, none), _RIGID_STEPS)
+    T_rigid = state.T
     graph = node_graph(state.rest, _SPACING)
     d = np.zeros((len(T_start), len(graph.nodes), 3))
     whole = _Adjustment(tracks, camera, graph)
     state = whole.minimised(_State(state.T, state.rest, d), _STEPS)
-    T = state.T.copy()
-    T[:, :3, 3] *= unit
     return DeformingMap(
-        T_world_camera=T,
+        T_world_camera=_in_unit(state.T, unit),
+        T_rigid=_in_unit(T_rigid, unit),
+        depth=unit,
+        spacing=unit * graph.spacing,
         rest=unit * state.rest,
         nodes=unit * graph.nodes,
         displacements=unit * state.d,
@@ -117,6 +121,12 @@ def adjust_deforming(
         weights=graph.weights,
         reliable=whole.reliable(state),
     )
+
+
+def _in_unit(T: F64, unit: float) -> F64:
+    out = T.copy()
+    out[:, :3, 3] *= unit
+    return out
 
 
 def _start(
@@ -127,18 +137,11 @@ def _start(
     count = int(i.max()) + 1 if len(i) else 0
     rays = np.concatenate([camera.normalise(tracks.points_px), np.ones((len(k), 1))], axis=1)
     rays = np.einsum("mij,mj->mi", T_world_camera[k, :3, :3], rays)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None] / (rays**2).sum(axis=1)[:, None, None]
     centres = T_world_camera[k, :3, 3]
-    A, b = np.zeros((count, 3, 3)), np.zeros((count, 3))
-    np.add.at(A, i, across)
-    np.add.at(b, i, np.einsum("mij,mj->mi", across, centres))
-    solved = np.linalg.solve(A + 1e-9 * np.eye(3), b[:, :, None])[:, :, 0]
-    rest = np.asarray(solved, np.float64)
+    rest = triangulate(i, rays, centres, count)
     depths = np.einsum("mi,mi->m", T_world_camera[k, :3, 2], rest[i] - centres)
     unit = float(np.median(depths[depths > 0.0])) if (depths > 0.0).any() else 1.0
-    T = T_world_camera.copy()
-    T[:, :3, 3] /= unit
-    return T, rest / unit, unit
+    return _in_unit(T_world_camera, 1.0 / unit), rest / unit, unit
 
 
 def _distance(state: _State) -> float:
@@ -160,6 +163,7 @@ class _Adjustment:
         self._tracks, self._intrinsics, self._graph = tracks, camera.intrinsics, graph
         self._prior = Prior(graph)
         self._damping = _FIRST_DAMPING
+        self._inverse = np.zeros((0, 0, 0))
 
     def minimised(self, state: _State, steps: int) -> _State:
         """Try this many steps; each that decreases the cost is taken.
@@ -167,8 +171,8 @@ class _Adjustment:
         The unit is kept: otherwise the map would shrink, and its displacements with it.
         """
         now, distance = self.linearised(state), _distance(state)
-        for _ in range(steps):
-            moved = self._stepped(state, now)
+        for step in range(steps):
+            moved = self._stepped(state, now, step % _INVERTED_EVERY == 0)
             moved = _scaled(moved, distance / _distance(moved))
             then = self.linearised(moved)
             if then.cost + self._prior_cost(moved) < now.cost + self._prior_cost(state):
@@ -187,7 +191,7 @@ class _Adjustment:
         r, squares = np.empty((count, 2)), np.empty(count)
         cost = linearise(
             *(t.keyframes, t.landmarks, t.points_px, self._intrinsics, state.T, state.rest),
-            *(state.d, self._graph.carriers, self._graph.weights, _NOISE_PX, _KERNEL_PX),
+            *(state.d, self._graph.carriers, self._graph.weights, _NOISE_PX, KERNEL_PX),
             *(J_camera, J_point, r, squares),
         )
         return _Linearised(J_camera, J_point, r, squares, cost)
@@ -201,13 +205,13 @@ class _Adjustment:
         # The least eigenvalue is the inverse of the largest variance.
         certain = np.linalg.eigvalsh(H)[:, 0] > 1.0 / _CERTAIN**2
         squares = np.bincount(landmarks, np.minimum(now.squares, 1e6), count)
-        fits = squares < _KERNEL_PX**2 * np.bincount(landmarks, minlength=count)
+        fits = squares < KERNEL_PX**2 * np.bincount(landmarks, minlength=count)
         return certain & fits
 
     def _prior_cost(self, state: _State) -> float:
         return float(np.vdot(state.d, self._prior.gradient(state.d)))
 
-    def _stepped(self, state: _State, now: _Linearised) -> _State:
+    def _stepped(self, state: _State, now: _Linearised, inverting: bool) -> _State:
         """One step: landmarks eliminated, the rest by conjugate gradients."""
         t, graph = self._tracks, self._graph
         table = (t.keyframes, t.landmarks, graph.carriers, graph.weights, now.J_camera, now.J_point)
@@ -242,10 +246,11 @@ class _Adjustment:
         b = -g
         times_transposed(*table, np.zeros((len(t.keyframes), 2)), of_points(-g_point), b)
         # b = -(g - W H^-1 g_point): the kernel subtracts J_point x, so x is -H^-1 g_point.
-        inverse = np.linalg.inv(H)
+        if inverting:
+            self._inverse = np.asarray(np.linalg.inv(H), np.float64)
 
         def precondition(v: F64) -> F64:
-            return np.einsum("kab,kb->ka", inverse, v)
+            return np.einsum("kab,kb->ka", self._inverse, v)
 
         x = conjugate_gradients(product, precondition, b, tolerance=_TOLERANCE, limit=_PRODUCTS)
         u, by_point = np.empty((len(t.keyframes), 2)), np.zeros((L, 3))

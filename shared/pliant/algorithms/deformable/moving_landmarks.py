@@ -27,13 +27,17 @@ class TrackedPoints:
 class DeformingMap:
     """A map whose landmarks move with the nodes of a graph.
 
-    T_world_camera: of K keyframes.    rest: landmarks at rest, world.
-    nodes: N nodes at rest.    displacements: of each node in each keyframe.
+    T_world_camera: of K keyframes.    T_rigid: of a rigid adjustment of the same tracks.
+    depth: the median one.    rest: landmarks at rest, world.
+    nodes: N nodes at rest, ``spacing`` apart.    displacements: of each node in each keyframe.
     carriers, weights: nodes of each landmark, and how much it follows each; they sum to 1.
     reliable: whether a landmark fits its pixels, and its rest place is certain.
     """
 
     T_world_camera: Annotated[F64, Shape("K", 4, 4)]
+    T_rigid: Annotated[F64, Shape("K", 4, 4)]
+    depth: float
+    spacing: float
     rest: Annotated[F64, Shape("L", 3)]
     nodes: Annotated[F64, Shape("N", 3)]
     displacements: Annotated[F64, Shape("K", "N", 3)]

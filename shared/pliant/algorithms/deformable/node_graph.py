@@ -25,16 +25,17 @@ class NodeGraph:
     edges: I64  # (E, 2)
     carriers: I64  # (L, NEAREST)
     weights: F64  # (L, NEAREST)
+    spacing: float
 
 
-_MOST = 150
+_MOST = 100
 """Nodes; a larger scene has them farther apart."""
 
 
 def no_nodes(count: int) -> NodeGraph:
     """The graph of a rigid scene with this many landmarks."""
     none = np.zeros((count, 0))
-    return NodeGraph(np.zeros((0, 3)), np.zeros((0, 2), np.int64), none.astype(np.int64), none)
+    return NodeGraph(np.zeros((0, 3)), np.zeros((0, 2), np.int64), none.astype(np.int64), none, 0.0)
 
 
 def node_graph(rest: F64, spacing: float) -> NodeGraph:
@@ -50,14 +51,15 @@ def node_graph(rest: F64, spacing: float) -> NodeGraph:
     near, apart = _nearest(nodes, nodes, min(_JOINED + 1, len(nodes)))
     pairs = np.stack([np.repeat(near[:, 0], near.shape[1] - 1), near[:, 1:].ravel()], axis=1)
     pairs = np.sort(pairs[apart[:, 1:].ravel() < _LONGEST * spacing], axis=1)
-    carriers, apart = _nearest(nodes, rest, NEAREST)
+    carriers, weights = carriers_of(rest, nodes, spacing)
+    return NodeGraph(nodes, np.unique(pairs, axis=0).reshape(-1, 2), carriers, weights, spacing)
+
+
+def carriers_of(points: F64, nodes: F64, spacing: float) -> tuple[I64, F64]:
+    """(P, NEAREST) nodes that carry points, and their weights."""
+    carriers, apart = _nearest(nodes, points, NEAREST)
     weights = np.exp(-0.5 * (apart / (_REACH * spacing)) ** 2) + _FAR
-    return NodeGraph(
-        nodes=nodes,
-        edges=np.unique(pairs, axis=0).reshape(-1, 2),
-        carriers=carriers,
-        weights=weights / weights.sum(axis=1, keepdims=True),
-    )
+    return carriers, weights / weights.sum(axis=1, keepdims=True)
 
 
 def _apart(points: F64, spacing: float) -> I64:

@@ -88,13 +88,6 @@ class SurfelParameters(Parameters):
             "observed for a short time."
         ),
     )
-    final_map: bool = Field(
-        default=False,
-        description=(
-            "At the end of a run on Pliant's own map, adjust cameras, rest shape and "
-            "displacements together: deforming_map.npz (not in the paper)."
-        ),
-    )
 
     max_surfels: int = Field(default=500, ge=1, le=20_000, description="Maximum number of surfels.")
     patch_px: int = Field(
