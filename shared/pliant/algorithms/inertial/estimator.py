@@ -116,7 +116,7 @@ class System:
         sums = preintegrate(signal, starts, ends, gyro, accel, densities)
         linear = linearised(state, sums, self._tied)
         root: F64 = np.asarray(np.linalg.inv(np.linalg.cholesky(sums.covariance)), np.float64)
-        walks = _walks(state, self._tied, ends - starts)
+        walks = bias_walks(state, self._tied, ends - starts)
         self._inertial = Linear(
             residual=np.concatenate([of_each(root, linear.residual), walks.residual], axis=1),
             by_first=np.concatenate([root @ linear.by_first, walks.by_first], axis=1),
@@ -125,12 +125,7 @@ class System:
         )
         turned = so3_log(nodes.R.swapaxes(1, 2) @ state.R)
         self._moved = np.concatenate([turned, state.p - nodes.p], axis=1)
-        self._prior, self._deviation = np.zeros((COMMON, COMMON)), np.zeros(COMMON)
-        own = np.arange(COMMON)
-        sigmas = np.full(COMMON, np.inf)
-        sigmas[TURN], sigmas[LEVER], sigmas[OFFSET] = _TURN_RAD, _LEVER_M, _OFFSET_S
-        self._prior[own, own] = 1.0 / sigmas**2
-        self._deviation[LEVER] = state.p_camera_imu
+        self._prior, self._deviation = prior_of_common(state)
 
     def solve(self, noise: PoseNoise) -> tuple[F64, F64]:
         """The step, (COMMON,) and (N, OWN).  Raises LinAlgError."""
@@ -147,7 +142,7 @@ class System:
         right[rows + 1] += second_t @ known
         diagonal[:, _POSE, _POSE] += self._pose_weights(noise)
         right[:, :6, COMMON] -= self._pose_weights(noise) * self._moved
-        for part, sigma, value in self._own_priors():
+        for part, sigma, value in own_priors(self.state, self._tied):
             diagonal[:, part, part] += 1.0 / sigma[:, None] ** 2
             right[:, part, COMMON] -= value / sigma[:, None] ** 2
         solved = solve_chain(diagonal, upper, right)
@@ -162,26 +157,6 @@ class System:
         force -= np.einsum("nri,nr->i", border, solved[:, :, COMMON])
         step = np.linalg.solve(self.information, force)
         return step, solved[:, :, COMMON] - self._carried @ step
-
-    def _own_priors(self) -> list[tuple[I64, F64, F64]]:
-        """Unknowns, standard deviations (N,) and values (N, 3).  The biases' is of the start of
-        each stretch without gaps: the walk starts there."""
-        count = len(self._times_s)
-        start = np.ones(count, np.bool_)
-        start[self._tied + 1] = False
-        return [
-            (np.arange(OWN)[VELOCITY], np.full(count, _SPEED_M_S), self.state.v),
-            (
-                np.arange(OWN)[GYRO],
-                np.where(start, _GYRO_BIAS_RAD_S, np.inf),
-                self.state.gyro_bias,
-            ),
-            (
-                np.arange(OWN)[ACCEL],
-                np.where(start, _ACCEL_BIAS_M_S2, np.inf),
-                self.state.accel_bias,
-            ),
-        ]
 
     def _pose_weights(self, noise: PoseNoise) -> F64:
         """(N, 6): inverse variances, less where a pose is an outlier."""
@@ -234,7 +209,30 @@ class System:
 _POSE = np.arange(6)
 
 
-def _walks(state: State, tied: I64, seconds: F64) -> Linear:
+def prior_of_common(state: State) -> tuple[F64, F64]:
+    """Information (COMMON, COMMON) of the common unknowns, and how far a state is from its mean."""
+    sigmas, deviation = np.full(COMMON, np.inf), np.zeros(COMMON)
+    sigmas[TURN], sigmas[LEVER], sigmas[OFFSET] = _TURN_RAD, _LEVER_M, _OFFSET_S
+    deviation[LEVER] = state.p_camera_imu
+    return np.diag(1.0 / sigmas**2), deviation
+
+
+def own_priors(state: State, tied: I64) -> list[tuple[I64, F64, F64]]:
+    """Unknowns, standard deviations (N,) and values (N, 3).  The biases' is of the start of each
+    stretch without gaps: the walk starts there.   tied: nodes that are tied to the next."""
+    count = len(state.v)
+    start = np.ones(count, np.bool_)
+    start[tied + 1] = False
+    gyro, accel = (np.where(start, each, np.inf) for each in (_GYRO_BIAS_RAD_S, _ACCEL_BIAS_M_S2))
+    own = np.arange(OWN)
+    return [
+        (own[VELOCITY], np.full(count, _SPEED_M_S), state.v),
+        (own[GYRO], gyro, state.gyro_bias),
+        (own[ACCEL], accel, state.accel_bias),
+    ]
+
+
+def bias_walks(state: State, tied: I64, seconds: F64) -> Linear:
     """The biases' random walks over intervals: 6 residuals of unit variance."""
     sigmas = np.repeat([_GYRO_WALK, _ACCEL_WALK], 3) * np.sqrt(seconds)[:, None]
     biases = np.concatenate([state.gyro_bias, state.accel_bias], axis=1)

@@ -34,7 +34,7 @@ from pliant.algorithms.slam.adjust.ordinary_frames import (
     refined_poses,
     smoothed_poses,
 )
-from pliant.algorithms.slam.adjust.segment import Moved, Segment
+from pliant.algorithms.slam.adjust.segment import InertialSource, Moved, Segment
 from pliant.algorithms.slam.atlas.atlas import Atlas
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.frame import Frame, IdealFrame, PlacedFrame
@@ -96,6 +96,7 @@ class Mapper:
         self._stamps_ns: dict[int, int] = {}  # capture time of each frame
         self._motion = Motion.at(0, 0, np.eye(4))  # in the active segment
         self._turns = FrameTurns.of(samples)
+        self._samples = samples
         self._without_pose: dict[int, None] = {}  # lost frames, in their order
         self._lost_frames = 0
         self._keyframe_ns = 0
@@ -268,7 +269,9 @@ class Mapper:
     def finish(self, timer: StageTimer = no_stages) -> MapDelta:
         """Apply the remaining corrections at the end of the stream."""
         self.start_at_last()
-        self.follow(self.atlas.finish(timer))
+        samples = self._samples
+        inertial = None if samples is None else InertialSource(samples, self._stamps_ns)
+        self.follow(self.atlas.finish(timer, inertial))
         with timer("skipped frames"):
             for segment, seen_by in self.atlas.everything():
                 self._correct(segment, segment.ordinary.take_all(), seen_by)

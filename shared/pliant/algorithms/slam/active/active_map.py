@@ -8,7 +8,7 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera, size_unit
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.slam.adjust.loops import Loop
-from pliant.algorithms.slam.adjust.segment import Segment
+from pliant.algorithms.slam.adjust.segment import InertialSource, Segment
 from pliant.algorithms.slam.adjust.window import Window
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.frame import IdealFrame, PlacedFrame
@@ -419,9 +419,11 @@ class ActiveMap:
         self.window.move(S)
         return S
 
-    def adjust_all(self, known: SelfCalibration) -> tuple[SelfCalibration, MapMoves | None]:
+    def adjust_all(
+        self, known: SelfCalibration, inertial: InertialSource | None = None
+    ) -> tuple[SelfCalibration, MapMoves | None]:
         """As ``Segment.adjust``."""
-        known, moves = self.segment.adjust(known, self.parameters)
+        known, moves = self.segment.adjust(known, self.parameters, inertial)
         self.seen_by = known
         self.rebuild_window()
         self._place_candidates()  # their positions are those before the adjustment

@@ -12,6 +12,7 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
+from pliant.algorithms.slam.adjust.inertial_adjustment import TimedSamples, with_samples
 from pliant.algorithms.slam.calibration.changing_focal import evidence_of_change, gaps_s, walk_from
 from pliant.algorithms.slam.calibration.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.slam.calibration.focal_search import best_along_focal
@@ -172,14 +173,16 @@ def adjust_keyframes(
     known: SelfCalibration,
     parameters: MappingParameters,
     motions: F64,
+    timed: TimedSamples | None = None,
 ) -> tuple[SelfCalibration, I32, MapMoves]:
     """Adjust all but the first keyframe, their landmarks and the calibration by Schur LM.
 
     Outlying observations are removed, and the landmarks' statistics updated.  The keyframes' pixels
     become those of the estimated camera, except for the readout.
     known: of the camera, whose pixels the keyframes have.    motions: (M, 6) of the keyframes, see
-    ``FramePoses``.    Returns the new calibration, the rows of landmarks that are at infinity or
-    seen by too few keyframes, and how the map around each keyframe moves.
+    ``FramePoses``.    timed: inertial samples.    Returns the new calibration, the
+    rows of landmarks that are at infinity or seen by too few keyframes, and how the map around each
+    keyframe moves.
     """
     given, before = known, known.view
     seen = list_observations(keyframes, points, known)
@@ -191,8 +194,9 @@ def adjust_keyframes(
     iterations = parameters.window.final_iterations
     poses, depths = seen.T_world_camera.copy(), seen.depths()
     found = adjust_list(
-        seen, known, parameters, iterations=iterations, start=known.correction, varying=True
-    )
+        seen, known, parameters, iterations=iterations, start=known.correction, varying=True,
+        timed=timed,
+    )  # fmt: skip
     known = known.corrected(found.correction, found.covariance, len(keyframes))
     known = replace(known, changes=bool(len(found.log_focal)), log_focal=float(seen.log_focal[-1]))
     view = known.view
@@ -226,12 +230,14 @@ def adjust_list(
     iterations: int,
     start: F64,
     varying: bool = False,
+    timed: TimedSamples | None = None,
 ) -> BundleResult:
     """Adjust all but the first keyframe, all landmarks of two keyframes, and the calibration.
 
     ``seen`` is changed, except for its observations, which are pixels of the rectified image.
     known: of the camera.   start: (SHARED,) initial correction of the calibration.   varying: the
-    focal length may change between keyframes, see ``changing_focal``.
+    focal length may change between keyframes, see ``changing_focal``.   timed: inertial samples,
+    which are used where that length does not change.
     """
     counts = np.bincount(seen.point, minlength=len(seen.rows))
     chosen = counts >= 2
@@ -256,6 +262,8 @@ def adjust_list(
             other = solve(walk=walk_from(seen.log_focal, seen.gaps_s), uncertainty=wide)
             confirmed = evidence.confirmed_by(other.log_focal, known=known.changes)
             found = other if confirmed else found
+    if timed is not None and uncertainty is not None and not len(found.log_focal):
+        found = with_samples(problem, found, bundle, uncertainty, timed)
     if varying:
         seen.log_focal = found.log_focal if len(found.log_focal) else 0.0 * seen.log_focal
     seen.xyz[chosen] = found.points_world

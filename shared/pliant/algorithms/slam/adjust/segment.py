@@ -30,8 +30,10 @@ from pliant.algorithms.geometry import (
     so3_log,
     transform_each,
 )
+from pliant.algorithms.inertial.samples import ImuSamples
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.slam.adjust.final_adjustment import adjust_keyframes
+from pliant.algorithms.slam.adjust.inertial_adjustment import TimedSamples
 from pliant.algorithms.slam.adjust.ordinary_frames import OrdinaryFrames
 from pliant.algorithms.slam.calibration.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.slam.calibration.rolling_shutter import FramePoses, RolledFrame
@@ -138,6 +140,13 @@ class Moved(NamedTuple):
     same_places: tuple[tuple[int, int], ...] = ()
 
 
+class InertialSource(NamedTuple):
+    """Inertial samples of a whole source, and the capture times of its frames."""
+
+    samples: ImuSamples
+    stamps_ns: dict[int, int]
+
+
 @dataclass(kw_only=True)
 class Segment:
     """points: rows shared by all segments.    keyframes: oldest first.   path: of its frames.
@@ -222,6 +231,21 @@ class Segment:
             keyframe.rolled_px = rolled.shifts(seen, depths)
             keyframe.points_px = seen - keyframe.rolled_px
 
+    def _timed(self, inertial: InertialSource | None) -> TimedSamples | None:
+        if inertial is None:
+            return None
+        frames, T_world_camera, _ = self.path.frames_on(self.keyframes)
+        number = {keyframe.id: n for n, keyframe in enumerate(self.keyframes)}
+        hosts = np.array([number[each.keyframe.id] for each in frames], np.int64)
+        T_world_host = np.array([keyframe.T_world_camera for keyframe in self.keyframes])[hosts]
+        return TimedSamples(
+            samples=inertial.samples,
+            keyframes_ns=np.array([keyframe.stamp_ns for keyframe in self.keyframes], np.int64),
+            frames_ns=np.array([inertial.stamps_ns[each.frame] for each in frames], np.int64),
+            hosts=hosts,
+            T_host_frame=inverse(T_world_host) @ T_world_camera,
+        )
+
     def move(self, moves: MapMoves) -> F64:
         """Move keyframes, landmarks and frames.  Returns the similarity (4, 4) of the newest
         keyframe.
@@ -269,16 +293,19 @@ class Segment:
         self.ordinary.take_in(earlier.ordinary)
 
     def adjust(
-        self, known: SelfCalibration, parameters: MappingParameters
-    ) -> tuple[SelfCalibration, MapMoves | None]:
+        self, known: SelfCalibration, parameters: MappingParameters,
+        inertial: InertialSource | None = None,
+    ) -> tuple[SelfCalibration, MapMoves | None]:  # fmt: skip
         """Adjust all but the first keyframe and the calibration, from the current estimate.
+
+        inertial: samples that the poses are to agree with.
 
         Returns the new calibration, and how dropped content moves, or None.
         """
         motions = self.path.motions(self.keyframes)
         before = np.array([keyframe.log_focal for keyframe in self.keyframes])
         found, gone, moves = adjust_keyframes(
-            self.keyframes, self.points, known, parameters, motions
+            self.keyframes, self.points, known, parameters, motions, self._timed(inertial)
         )
         self.points.remove(gone)
         self.to_global_shutter(self.keyframes, found)

@@ -318,6 +318,38 @@ class SchurSystem:
             covariance[:, k] = np.inf if solution is None else self.calibration.change(solution)
         return covariance
 
+    def pose_information(self) -> F64:
+        """(6 M, 6 M) inverse covariance of the cameras' poses at the start, with everything else
+        unknown, at residuals of 1 px; 0 where a camera is fixed.
+
+        Of changes (a, d) of a pose: R Exp(a), p + d.  A step (rho, theta) of ``projection`` is
+        (-R^T d, -a).
+        """
+        S, _, _ = self._undamped
+        pattern, M = self.pattern, len(self.layout.free)
+        N, F = len(pattern.start) - 1, len(self._moving)
+        blocks = np.zeros((N, 6, N, 6))
+        columns = np.repeat(np.arange(N), np.diff(pattern.start))
+        blocks[pattern.row, :, columns, :] = S.reshape(-1, 6, 6)
+        dense = np.tril(blocks.reshape(6 * N, 6 * N))
+        dense += np.tril(dense, -1).T
+        own = np.arange(6 * F, 6 * N)
+        dense[own, own] += np.where(dense[own, own] == 0.0, 1.0, 0.0)  # no unknowns
+        border = dense[: 6 * F, 6 * F :]
+        poses = dense[: 6 * F, : 6 * F] - border @ np.linalg.solve(
+            dense[6 * F :, 6 * F :], border.T
+        )
+        by_change = np.zeros((F, 6, 6))
+        by_change[:, :3, 3:] = -self.layout.cameras.motion[self._moving, :9].reshape(F, 3, 3)
+        by_change[:, 3:, :3] = -np.eye(3)
+        at = self._position[self._moving]
+        poses = poses.reshape(F, 6, F, 6)[at][:, :, at]
+        poses = np.einsum("mri,mrnc->minc", by_change, poses)
+        poses = np.einsum("minc,ncj->minj", poses, by_change)
+        information = np.zeros((M, 6, M, 6))
+        information[self._moving[:, None], :, self._moving, :] = poses.transpose(0, 2, 1, 3)
+        return information.reshape(6 * M, 6 * M)
+
     def gain_of_focal(self) -> tuple[float, F64]:
         """Decrease of the cost, px^2, by a linear step from the start with a focal length per
         camera; and these (M,).  Zeros if the step has no solution.

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.slam.adjust.segment import Segment, see_by
+from pliant.algorithms.slam.adjust.segment import InertialSource, Segment, see_by
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.map.landmarks import Landmarks
 from pliant.algorithms.slam.parameters import MappingParameters, WindowParameters
@@ -102,7 +102,9 @@ class EarlierSegments:
     def _observations(some: list[_Earlier]) -> int:
         return observations_of([each.segment for each in some])
 
-    def adjust(self, parameters: MappingParameters) -> list[tuple[int, MapMoves]]:
+    def adjust(
+        self, parameters: MappingParameters, inertial: InertialSource | None = None
+    ) -> list[tuple[int, MapMoves]]:
         """Adjust each of them at the end of the stream, except unchanged segments of a loaded map.
 
         Returns the moves of each segment, by its number, and of what it has dropped.
@@ -113,7 +115,7 @@ class EarlierSegments:
                 back = earlier.segment.back()
                 if back is not None:
                     earlier.segment.move(back)
-                found, moved = earlier.segment.adjust(earlier.calibration, parameters)
+                found, moved = earlier.segment.adjust(earlier.calibration, parameters, inertial)
                 self._kept[n] = earlier._replace(calibration=found)
                 moves += [(earlier.segment.id, each) for each in (back, moved) if each is not None]
         self.adjusted = [earlier.segment for earlier in self._kept if not earlier.known]
