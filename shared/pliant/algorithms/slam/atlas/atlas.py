@@ -145,7 +145,7 @@ class Atlas:
         search = LandmarkSearch(self.points, maxima, grey, view.camera, self._parameters, generator)
         return self.places.recognise(search, segments, view)
 
-    def go_on(self, seen: Keyframe, ids: I64) -> None:
+    def resume(self, seen: Keyframe, ids: I64) -> None:
         """Continue the segment of a recognised keyframe at its place.
 
         ids: of the tracks.
