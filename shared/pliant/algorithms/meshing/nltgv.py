@@ -51,6 +51,8 @@ from pliant.compiler.kernel import fast_kernel, kernel
 
 _MIN_SHIFT_SIGMAS = 3.0
 _HALF_U, _HALF_V, _FIRST, _SECOND, _FIRST_STEP, _SECOND_STEP = range(6)
+_RELAXATION = 1.9
+"""Over-relaxation of the iteration (rho)."""
 _MIN_LENGTH = 0.2
 """Edges shorter than this (in mean edges) weigh no more: their slopes are noise."""
 _MIN_WEIGHT = 1e-3
@@ -162,7 +164,7 @@ def smooth(
         )  # fmt: skip
         done, change = _iterate(
             data, directed, weights, state, duals,
-            parameters.relaxation, parameters.min_change_sigmas, parameters.max_iterations,
+            _RELAXATION, parameters.min_change_sigmas, parameters.max_iterations,
         )  # fmt: skip
         total += done
     return NltgvResult(

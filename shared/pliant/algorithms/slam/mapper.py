@@ -308,7 +308,7 @@ class Mapper:
         self._poses.add(number, keyframe, T_world_camera, support.inliers)
 
     def _tracked(self, placed: PlacedFrame) -> Outcome:
-        why = why_doubtful(placed.support, self._parameters.support)
+        why = why_doubtful(placed.support)
         return self._outcome(TRACKING, why, placed.support.inliers)
 
     def _skipped(self, reason: str) -> Outcome:
