@@ -158,13 +158,7 @@ def without(result: Path, output: Path, *left_out: Topic, frame: int | None = No
                 assert isinstance(end, StreamEnd)
                 about = by_key(end.topic)
             if about not in left_out or frame not in (None, message.sequence):
-                writer.write(
-                    message.topic,
-                    message.data,
-                    sequence=message.sequence,
-                    log_time_ns=message.log_time_ns,
-                    publish_time_ns=message.publish_time_ns,
-                )
+                message.write_to(writer)
     return output
 
 

@@ -110,7 +110,7 @@ class Cluster:
             why = "Pliant is not installed on a worker: install the same release there"
         elif isinstance(error, self._distributed.scheduler.KilledWorker):
             why = "several workers died while processing it"
-        return Outcome(exit_code=1, told={"verdict": "failed", "reason": why})
+        return Outcome(exit_code=1, entry={"verdict": "failed", "reason": why})
 
 
 def _run(name: str, errand: Errand, topic: str) -> Outcome:

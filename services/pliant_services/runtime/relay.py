@@ -101,7 +101,7 @@ class Relay:
         """Forward until the last viewer is gone; of a session that is over, its last messages."""
         outputs = {topic: self._publisher(topic) for topic in (*topics.VIEWED, topics.STREAM)}
         inputs = {topic: self._ring(topic.key, topic.viewed) for topic in topics.VIEWED}
-        told = self._ring(topics.status("*").key, _STATUS_RING)
+        statuses = self._ring(topics.status("*").key, _STATUS_RING)
         greeted: set[str] = set()
         idle, last_word = False, time.monotonic() + _LAST_WORDS_S
         while self._viewers:
@@ -119,7 +119,7 @@ class Relay:
                 if sample is not None:
                     idle = False
                     outputs[topic].put(sample.payload, attachment=sample.attachment)
-            sample = told.try_recv()
+            sample = statuses.try_recv()
             if sample is not None:
                 idle = False
                 key = str(sample.key_expr).removeprefix(f"{self._prefix}/")
@@ -131,7 +131,7 @@ class Relay:
                 )
             if idle:
                 self._stopping.wait(_PAUSE_S)
-        for declared in (*inputs.values(), told, *outputs.values()):
+        for declared in (*inputs.values(), statuses, *outputs.values()):
             declared.undeclare()
 
     def _ring(self, key: str, size: int) -> Any:

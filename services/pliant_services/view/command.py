@@ -221,13 +221,13 @@ def _draw_while(canvas: Canvas, waiting: Backlog, goes_on: Callable[[], bool]) -
     goes_on: whether a service still runs, and a viewer is open.
     """
     scene = Scene(canvas)
-    asked, is_over = time.monotonic(), False
+    looked_at, is_over = time.monotonic(), False
     while True:
-        if not is_over and time.monotonic() - asked > _ASK_S:
-            is_over, asked = not goes_on(), time.monotonic()
+        if not is_over and time.monotonic() - looked_at > _ASK_S:
+            is_over, looked_at = not goes_on(), time.monotonic()
         arrived = waiting.take()
         if arrived is None:
-            if is_over and time.monotonic() - asked > _GONE_S:
+            if is_over and time.monotonic() - looked_at > _GONE_S:
                 break
             time.sleep(0.005)
             continue

@@ -95,7 +95,7 @@ def run(
     for setting in overrides_of(settings):
         command += ["--set", setting]
     command += ["--", str(source)]  # its name may begin with a dash
-    said = ""
+    last_line = ""
     with subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         text=True, start_new_session=True,  # Ctrl-C is ours to hand on, once
@@ -104,9 +104,9 @@ def run(
         try:
             for line in process.stdout:
                 if on_frame is not None and line.startswith("pose "):
-                    on_frame(*_told(line))
+                    on_frame(*_pose_of(line))
                     continue
-                said = line.strip() or said
+                last_line = line.strip() or last_line
                 if not quiet:
                     print(line, end="", file=sys.stderr)  # a notebook's, too
         except BaseException:
@@ -114,11 +114,11 @@ def run(
             process.communicate()
             raise
     if process.returncode not in (DONE, INCOMPLETE) or not parts.exists(folder / RECORDING_NAME):
-        raise ResultError(said.removeprefix("pliant: "))
+        raise ResultError(last_line.removeprefix("pliant: "))
     return Result(folder)
 
 
-def _told(line: str) -> tuple[int, F64 | None]:
+def _pose_of(line: str) -> tuple[int, F64 | None]:
     """Parse a line of ``--poses``: the number of a frame, and its pose (4, 4) or None."""
     _, frame, _, *pose = line.split()
     return int(frame), pose_to_matrix(np.array(pose, np.float64)) if pose else None

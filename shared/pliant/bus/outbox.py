@@ -178,7 +178,7 @@ class Outbox:
         """Messages held here: at most a window and what the slowest checkpoint lies behind."""
         return len(self._kept)
 
-    def asked_for(self) -> tuple[Numbered, ...]:
+    def take_requested(self) -> tuple[Numbered, ...]:
         """The messages that readers have requested and still lack, once.
 
         By their latest report: delayed reports arrive together, and after the last of them the

@@ -36,7 +36,7 @@ class Waiting:
         """The wait is over."""
         self.text = ""
 
-    def told(self, now: float) -> str:
+    def description(self, now: float) -> str:
         """A description of the wait, with its length if it is long; "" without one."""
         waited_s = now - self.since
         if not self.text or waited_s < _WORTH_TELLING_S:

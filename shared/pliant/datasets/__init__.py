@@ -174,9 +174,9 @@ def formats() -> dict[str, SourceFormat]:
         try:
             kind: object = point.load()
         except Exception as error:  # of foreign code
-            said = shortened(f"{type(error).__name__}: {error}".split("\n")[0], 200)
+            reason = shortened(f"{type(error).__name__}: {error}".split("\n")[0], 200)
             raise DatasetError(
-                f"the source format {point.name} ({point.value}) does not load: {said}; fix or "
+                f"the source format {point.name} ({point.value}) does not load: {reason}; fix or "
                 "uninstall its package"
             ) from error
         if not isinstance(kind, SourceFormat):

@@ -72,16 +72,18 @@ def read_list(file: Path, folder: Path, *, unit: str = "seconds") -> ImageList:
         )
     stamps, notes = stamps_of([(row.line, row.time) for row in rows], file, unit)
     images = [ListedImage(stamp_ns=t, path=row.path) for t, row in zip(stamps, rows, strict=True)]
-    images, told = mended(images, [row.line for row in rows], file)
+    images, more_notes = mended(images, [row.line for row in rows], file)
     if missing:
         of = f"{counted(len(missing), 'file')} of {len(rows)}"
-        told.append(
+        more_notes.append(
             f"{file.name}: {of} (the first in line {missing[0].line}) are missing and count "
             "as broken"
         )
     others = [row.other for row in rows if row.other is not None]
     return ImageList(
-        images, others if len(others) == len(rows) else [], [*notes, *told, *_unlisted(file, rows)]
+        images,
+        others if len(others) == len(rows) else [],
+        [*notes, *more_notes, *_unlisted(file, rows)],
     )
 
 
@@ -141,11 +143,11 @@ def mended(
             found[each] = replace(images[each], stamp_ns=between_ns, fault=why_wrong(stamps[each]))
         last_ns, waiting = stamps[row], []
     first = next(row for row in range(len(stamps)) if found[row].fault)
-    told = (
+    more_notes = (
         f"{file.name}: the times of {counted(wrong, 'image')} do not increase (the first in line "
         f"{lines[first]}), and count as broken"
     )
-    return found, [told]
+    return found, [more_notes]
 
 
 def inside(folder: Path, name: str, where: str) -> Path:

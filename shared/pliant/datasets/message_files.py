@@ -203,8 +203,8 @@ def recorded_image(time_ns: int, decode: Callable[[bytes], Any], data: bytes) ->
     try:
         return RecordedImage(time_ns, decode(data))
     except Exception as error:  # of a foreign parser on foreign bytes
-        said = shortened(" ".join(str(error).split())) or type(error).__name__
-        return RecordedImage(time_ns, None, fault=f"its message is damaged ({said})")
+        reason = shortened(" ".join(str(error).split())) or type(error).__name__
+        return RecordedImage(time_ns, None, fault=f"its message is damaged ({reason})")
 
 
 def missing_library(path: Path, library: str) -> DatasetError:
@@ -214,7 +214,7 @@ def missing_library(path: Path, library: str) -> DatasetError:
 
 def damaged(path: Path, error: BaseException, hint: str) -> DatasetError:
     """One line for any error of a library about a broken file."""
-    said: Any = " ".join(str(error).split())[:120]
+    reason: Any = " ".join(str(error).split())[:120]
     return DatasetError(
-        f"{path}: is truncated or damaged ({said or type(error).__name__}); repair it with {hint}"
+        f"{path}: is truncated or damaged ({reason or type(error).__name__}); repair it with {hint}"
     )

@@ -12,6 +12,7 @@ from pliant.messages.topics import MAP_FINAL, Topic, by_key
 from pliant.messages.types import Header
 from pliant.recording.parts import parts_of
 from pliant.recording.scan import Closed, Damage, Item, StoredMessage, scan
+from pliant.recording.writer import RecordingWriter
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,13 @@ class Recorded:
     def decode(self) -> Header:
         """The message.  Raises MessageError where its bytes are not what its topic carries."""
         return codec.decode(self.topic.message, self.data, max_bytes=self.topic.max_bytes)
+
+    def write_to(self, writer: RecordingWriter) -> None:
+        """Append the message to another recording, with its number and times."""
+        writer.write(
+            self.topic, self.data, sequence=self.sequence, log_time_ns=self.log_time_ns,
+            publish_time_ns=self.publish_time_ns,
+        )  # fmt: skip
 
 
 class Recording:

@@ -88,13 +88,7 @@ def recover(damaged: Path, output: Path, *, keep: Callable[[Recorded], bool] = d
 
 
 def _keep(writer: RecordingWriter, message: Recorded, recovery: Recovery) -> None:
-    writer.write(
-        message.topic,
-        message.data,
-        sequence=message.sequence,
-        log_time_ns=message.log_time_ns,
-        publish_time_ns=message.publish_time_ns,
-    )
+    message.write_to(writer)
     if message.topic is not topics.STREAM_END:
         recovery.messages += 1
         recovery.unchecked += not message.checked

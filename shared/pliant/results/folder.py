@@ -383,14 +383,14 @@ def commit_of(package: Path) -> str:
     git = ("git", "-C", package)
     own = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
 
-    def said(*arguments: str) -> str:
+    def output_of(*arguments: str) -> str:
         command = [*git, *arguments]
         done = subprocess.run(command, capture_output=True, text=True, timeout=5, env=own)
         return done.stdout.strip() if done.returncode == 0 else ""
 
     try:
-        tracked = said("ls-files", "--full-name", "__init__.py")
-        return said("rev-parse", "HEAD") if tracked == "shared/pliant/__init__.py" else ""
+        tracked = output_of("ls-files", "--full-name", "__init__.py")
+        return output_of("rev-parse", "HEAD") if tracked == "shared/pliant/__init__.py" else ""
     except (OSError, subprocess.SubprocessError):
         return ""
 

@@ -52,13 +52,13 @@ def judge(
     of_source = max(frames + absent, 1)
     share = longest / of_source
     which = "frames of the source" if broken or absent else "frames"
-    told = f"{share:.0%} of the {which} have a pose in the largest segment"
-    told += f", {by_gyro} are placed by the gyro alone" if by_gyro else ""
+    text = f"{share:.0%} of the {which} have a pose in the largest segment"
+    text += f", {by_gyro} are placed by the gyro alone" if by_gyro else ""
     if longest < _LITTLE * (of_source - behind):
-        return BAD, told
+        return BAD, text
     if share < _WHOLE and 2 * behind > of_source - longest:
         return DOUBTFUL, (
-            f"{told}: the computer was too slow for {behind / of_source:.0%}; use smaller images "
+            f"{text}: the computer was too slow for {behind / of_source:.0%}; use smaller images "
             "(--max-size) or fewer tracks (--light)"
         )
     if focal:
@@ -74,12 +74,12 @@ def judge(
     if broken > (1.0 - _WHOLE) * frames:
         return DOUBTFUL, f"{broken / frames:.0%} of the images are broken"
     if share < _WHOLE:
-        return DOUBTFUL, told
+        return DOUBTFUL, text
     if failed:
         return DOUBTFUL, "the source ended early"
     if calibration:
         return DOUBTFUL, calibration
-    return GOOD, told if longest < of_source else "all frames have a pose in one segment"
+    return GOOD, text if longest < of_source else "all frames have a pose in one segment"
 
 
 def slipping_frames(tracked: Sequence[int], in_view: Sequence[int]) -> list[int]:

@@ -213,9 +213,9 @@ def seen_by_keyframes(recording: Recording, wanted: Container[int]) -> dict[int,
             ends = np.cumsum(message.counts)
             for row, number in enumerate(message.keyframe_ids.tolist()):
                 if number in wanted:
-                    told = slice(int(ends[row] - message.counts[row]), int(ends[row]))
-                    seen[number].point_ids = message.point_ids[told]
-                    seen[number].points_px = message.points_px[told]
+                    part = slice(int(ends[row] - message.counts[row]), int(ends[row]))
+                    seen[number].point_ids = message.point_ids[part]
+                    seen[number].points_px = message.points_px[part]
     return dict(seen)
 
 

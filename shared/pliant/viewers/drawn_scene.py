@@ -157,7 +157,7 @@ class Scene:
         world.moved = world.moved or bool(mine.any())
         self._take_places(at, update, final=final)
         here = update.point_segments == world.segment
-        world.points.tell(
+        world.points.update(
             update.point_ids[here],
             update.points_world[here].astype(np.float32),
             update.point_colours[here],

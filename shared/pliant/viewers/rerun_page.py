@@ -52,10 +52,10 @@ class RerunPage:
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
-                told, slash, rest = self.path[1:].partition("/")
+                given, slash, rest = self.path[1:].partition("/")
                 if not _THIS_MACHINE.fullmatch(self.headers.get("Host", "")):
                     self.send_error(403)
-                elif not hmac.compare_digest(told.encode(), token.encode()):
+                elif not hmac.compare_digest(given.encode(), token.encode()):
                     self.send_error(404)
                 elif slash + rest == _DATA:
                     self._send_data()

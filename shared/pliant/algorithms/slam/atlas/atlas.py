@@ -272,7 +272,7 @@ class Atlas:
         newest = active.keyframes[-1]
         pose = newest.T_world_camera
         see_by(active.segment, before.view, self.calibration, refocus)
-        active.see_anew(self.calibration)
+        active.use_calibration(self.calibration)
         self._earlier.see_by(before, self.calibration)
         self._adjusted = True  # readers have the landmarks of the previous calibration
         return Moved(newest.T_world_camera @ inverse(pose))

@@ -59,8 +59,8 @@ def smooth_trajectory(
     make their motion smooth.  A trajectory is split where a pose would contradict its own
     observations, as at a cut.
     """
-    told = np.diagonal(information, axis1=1, axis2=2)
-    known = np.isfinite(information).all(axis=(1, 2)) & (told > 0.0).all(axis=1)
+    diagonals = np.diagonal(information, axis1=1, axis2=2)
+    known = np.isfinite(information).all(axis=(1, 2)) & (diagonals > 0.0).all(axis=1)
     smoothed, runs = T_world_camera.copy(), [np.flatnonzero(known)]
     while runs:
         run = runs.pop()

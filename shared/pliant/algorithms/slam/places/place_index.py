@@ -246,10 +246,10 @@ class PlaceIndex:
         ]
         dead = len(self.ids) - len(self.features)
         if dead > max(_LEAST_DEAD, len(self.features)):
-            anew = PlaceIndex()
+            rebuilt = PlaceIndex()
             for place, features in self.features.items():
-                anew.add(place, features)
-            vars(self).update(vars(anew))
+                rebuilt.add(place, features)
+            vars(self).update(vars(rebuilt))
 
     def query(self, features: Features) -> list[int]:
         """Ids of the places that share words with an image, the most alike first."""
