@@ -1,8 +1,8 @@
 """Supervises one run: starts the services in order, watches them, stops them cleanly.
 
 The launcher hosts the router, so that a run needs no other program; every service is a process of
-its own.  When the source ends, or on Ctrl-C, the end of the stream passes through the services and
-each leaves by itself once it has read everything, so that nothing on the way is lost.
+its own.  When the source ends, or on Ctrl-C, the end of the stream passes through the services.
+Each exits once it has read everything, so no message is lost.
 """
 
 import os

@@ -235,7 +235,7 @@ class Relays:
 
 
 def _camera_in(sample: zenoh.Sample) -> tuple[bytes, bytes] | None:
-    """A camera as a session tells it, with its envelope; None for anything else."""
+    """A camera as a session publishes it, with its envelope; None for anything else."""
     envelope = sample.attachment.to_bytes() if sample.attachment is not None else b""
     if envelope[-1:] != b"\x00" or len(sample.payload) > topics.STREAM.max_bytes:
         return None

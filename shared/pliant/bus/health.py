@@ -59,7 +59,7 @@ class Health(Header):
 
 
 def health_key(service: str) -> str:
-    """The key on which a service tells its health, without the session's prefix."""
+    """The key on which a service publishes its health, without the session's prefix."""
     return f"health/{service}"
 
 

@@ -1,8 +1,8 @@
 """The other services in the session, by their liveliness tokens.
 
-A token says ``ready/<service>/<incarnation>/<wire version>/<release>+<schema>``.  The incarnation
-tells one start of a service from the next, so that the late end of an old token is not taken for
-the death of the service that has come back.  A state machine: no socket, the time is handed in.
+A token is ``ready/<service>/<incarnation>/<wire version>/<release>+<schema>``.  The incarnation
+differs in each start of a service, so that the late end of an old token is not mistaken for the
+death of the restarted service.  A state machine without a socket; the caller passes the time.
 """
 
 import re

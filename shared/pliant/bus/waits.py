@@ -118,4 +118,4 @@ class Waits:
             while len(self.peers.missing(senders)) < len(senders):
                 if time.monotonic() >= deadline:
                     return
-                self.changed.wait(TICK_S)  # the keeper tells our counts again meanwhile
+                self.changed.wait(TICK_S)  # the keeper repeats our counts meanwhile

@@ -1,7 +1,7 @@
 """The bus over Zenoh, with our own flow control and our own delivery.
 
 Zenoh's BLOCK is no guarantee (a reader that stalls longer than the transport's patience loses
-messages and ``put`` never says so; a router that dies takes what it holds with it), hence sequence
+messages and ``put`` never fails; a router that dies takes what it holds with it), hence sequence
 numbers and credits: a reader reports how many messages of a topic it has taken, and how many it
 will never request again.  A sender never has more than a window on the way to its slowest required
 reader, and keeps messages that may be requested.  A reader requests missing messages.  So each
@@ -12,8 +12,8 @@ for the tokens of its required readers before its first message.  A peer that st
 than our patience is named in an error, so that every wait ends.
 
 With checkpoints a service that died continues where it was: ``restore`` puts it back to the newest
-checkpoint that its readers allow, senders send again what came after, and what it makes a second
-time is passed over by those who had it.
+checkpoint that its readers allow.  Senders repeat what came after it, and readers skip messages
+that they already have.
 
 Callbacks only append to queues and notify: no Zenoh call is ever made inside one.  A thread of its
 own (``keeper.py``) reports counts once a second and repeats messages.

@@ -1,9 +1,9 @@
 """Numba's cache on disk, which notices a change in any module that a kernel is built from.
 
-Numba stamps a cached kernel with the text of the file that it stands in.  A helper or a constant
-from another file is compiled into the kernel all the same, so that after an edit or an upgrade an
-old kernel would continue running, silently.  Here the stamp covers every module of ours that the
-kernel's module imports, directly or not.
+Numba stamps a cached kernel with the text of the file that it stands in.  But helpers and constants
+from other files are compiled into the kernel, too.  So after an edit or an upgrade an old kernel
+would silently stay in use.  Here the stamp covers every module of ours that the kernel's module
+imports, directly or not.
 
 Kernels are kept in NUMBA_CACHE_DIR, else beside their sources, else in Pliant's cache folder.
 """

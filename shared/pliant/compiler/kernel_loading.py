@@ -41,7 +41,7 @@ def parse_when_needed() -> None:
         return link(self)
 
     def address_of(self: Any, name: str) -> Any:
-        if getattr(self, "unparsed", None) is not None:  # numba asks its list of symbols first
+        if getattr(self, "unparsed", None) is not None:  # numba looks in its list of symbols first
             return self._codegen._engine.get_function_address(name)
         return address(self, name)
 

@@ -159,7 +159,7 @@ def _euroc(content: Keys, wanted: Wanted) -> Keys:
 
 
 def _opencv(content: Keys, wanted: Wanted) -> Keys:
-    """Its samples name no model: the count of the coefficients, or ``fisheye_model``, tells."""
+    """Its files name no model: the number of coefficients, or ``fisheye_model``, determines it."""
     K = _numbers(content, _first(content, _MATRIX), 9)
     width, height = (content.get(_first(content, names)) for names in _SIZE)
     model = _model_name(content)

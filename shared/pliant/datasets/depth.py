@@ -5,8 +5,8 @@
 
 or, without that list, the right images of a stereo pair: see ``pliant.datasets.stereo``.
 
-A depth map belongs to the image that is nearest in time, if that is within 20 ms (as in the TUM
-benchmark's tools) and it is the nearest to that image.
+A depth map belongs to an image if each is nearest in time to the other, within 20 ms (as in the TUM
+benchmark's tools).
 """
 
 from collections.abc import Sequence

@@ -26,7 +26,7 @@ def size_of(frame: SourceFrame) -> tuple[int, int]:
     if stated is None or small is None:
         height, width = decode(frame).shape[:2]
         return width, height
-    turned = (small[0] > small[1]) != (stated[1] > stated[0])  # as the file says
+    turned = (small[0] > small[1]) != (stated[1] > stated[0])  # as the file states
     return (stated[1], stated[0]) if turned else stated
 
 

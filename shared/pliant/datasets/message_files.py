@@ -169,7 +169,7 @@ def _with_images(listed: str) -> str:
 
 
 def _calibration(opened: OpenMessages, images: MessageTopic, where: str) -> Calibration | None:
-    """The camera that belongs to a topic of images: the topic nearest by name tells it.
+    """The camera that belongs to a topic of images: that of the topic with the most similar name.
 
     /left/image_raw has /left/camera_info; where two are equally near, nothing is guessed.
     """

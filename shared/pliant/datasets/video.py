@@ -70,7 +70,7 @@ class VideoFile:
             self.notes.append(f"pixel aspect ratio {float(aspect):.3g}")
 
     def reaches(self, time_s: float) -> bool:
-        """Whether a frame is found there by seeking; where none is, only reading tells."""
+        """Whether a frame is found there by seeking; otherwise only reading shows."""
         with opened(self.file) as decoder:
             if decoder.stream is not None and decoder.stream.shown_ns:
                 return False

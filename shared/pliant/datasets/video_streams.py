@@ -31,7 +31,7 @@ class VideoStream:
     is_default: not marked as one to be passed over.
     is_still: a cover picture or thumbnails, no film.
     frames: how many it has; None if unknown to its headers.
-    stamps_ns: when frames are shown, sorted, in media time; () where only reading tells.
+    stamps_ns: when frames are shown, sorted, in media time; () if only reading shows.
     origin_ns: when the first is shown in the order of decoding, from which OpenCV counts.
     shown_ns: intervals of media time that are to be shown; () for all.
     may_change: whether the size of its images may change on the way.

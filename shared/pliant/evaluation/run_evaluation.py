@@ -111,7 +111,7 @@ class TrajectoryEvaluation:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """One run: both trajectories, and how often its map had to start anew before it could.
+    """One run: both trajectories, and how often a start of its map failed before.
 
     offset_s: was added to the times of the poses.   better: a further offset with which the final
     ones fit ground truth far better.

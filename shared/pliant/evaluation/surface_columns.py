@@ -1,9 +1,9 @@
 """A mesh against the true surface as the field's tables have it, registered in several ways.
 
 Monocular systems are compared on 7-Scenes by accuracy (mesh to ground truth), completion (ground
-truth to mesh) and Chamfer distance (their mean), as RMSE over what lies within 0.5 m; VGGT-SLAM's
-script aligns by the trajectory's Sim(3) and then by ICP.  The other columns show what ICP hides,
-and the last one the limit of any map: the true depth itself, seen from our poses.
+truth to mesh) and Chamfer distance (their mean).  Each is the RMSE over distances below 0.5 m;
+VGGT-SLAM's script aligns by the trajectory's Sim(3) and then by ICP.  The other columns show what
+ICP hides, and the last one the limit of any map: the true depth itself, seen from our poses.
 """
 
 from dataclasses import dataclass

@@ -159,7 +159,7 @@ def _check_ending(path: Path, to: str, name: str) -> None:
 
 
 class _Followed(MetricRecording):
-    """A recording that tells how many of its images have been read: they take the time."""
+    """A recording that reports how many of its images have been read, which takes the time."""
 
     def __init__(self, path: Path, progress: Progress | None) -> None:
         super().__init__(path)

@@ -28,10 +28,10 @@ class AnimatedMesh:
 def write_animated_glb(path: Path, mesh: AnimatedMesh, extras: dict[str, Any]) -> None:
     """The first key frame as the rest shape, and displacements from it as morph targets.
 
-    At key frame k the weight of its own target is 1 and of all others 0, with linear interpolation
-    between, so the vertices move on straight lines from key frame to key frame.  Positions are
-    exact there but for the rounding of float32.    said: what readers show of the object.
-    Raises ResultError.
+    At key frame k its own target has the weight 1 and all others 0, with linear interpolation
+    between.  So vertices move on straight lines from key frame to key frame.  Positions are exact
+    there but for the rounding of float32. said: what readers show of the object.  Raises
+    ResultError.
     """
     glb = Glb()
     rest, *moved = mesh.positions

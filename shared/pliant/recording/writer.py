@@ -177,7 +177,7 @@ class RecordingWriter:
         try:
             self.close()
         except RecordingError:
-            if error_type is None:  # else the first error tells more than this one
+            if error_type is None:  # otherwise the first error is more helpful
                 raise
 
     def _close_chunks(self) -> None:

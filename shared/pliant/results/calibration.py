@@ -58,12 +58,12 @@ _TURN_DEG = 20.0
 
 
 def found_calibration(run: Run) -> Calibration | None:
-    """The source's calibration, at the size of its images, corrected as its last segment is.
+    """The calibration of the source, at the size of its images, with the correction of the last
+    segment; None without a stream.
 
-    Its ``focal_sigma`` says what is still open: a map that was made with a wrong one is bent, and
-    so its estimate is as far off as the two differ.  Where the focal length changes during
-    the clip it is the middle of the range, and uncertain by half of it.
-    None where there is no stream.
+    ``focal_sigma`` includes the difference between the given and the estimated focal length: a
+    map that started with a wrong one is bent.  If the focal length changes during the clip, the
+    calibration has the middle of its range, and half of the range as uncertainty.
     """
     if run.stream is None or not run.stream.calibration:
         return None

@@ -64,7 +64,7 @@ def _check_mapped(run: Run, *places: Sequence[float]) -> None:
 def from_depth(recording: Recording, run: Run, source: str) -> Scale:
     """By the depth maps of the run's source, or of another with the same images and stamps.
 
-    Each keyframe tells a ratio, the median of measured depth by that of the map over the points
+    Each keyframe gives a ratio, the median of measured depth by that of the map over the points
     that it sees; the scale is the median of these, its sigma their spread, as all share the errors
     of a sensor.  Raises PliantError.
     """

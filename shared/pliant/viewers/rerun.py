@@ -8,8 +8,8 @@
     curves/lag, milliseconds, rate, stages      how the services fare
     notes                                       lines for the user
 
-The camera is beside the worlds of the map's segments, so that the image stays where it is when
-the map is lost and the next world begins.
+The camera is outside the worlds of the map's segments.  So the image stays in its place when the
+map is lost and the next world begins.
 
 Time runs by "frame" and by "capture".  Needs Rerun: ``pip install 'pliant[view]'``.
 """

@@ -23,7 +23,7 @@ T_k = 1 / sum_e |K_ek| and S_e = 1 / sum_k |K_ek|, written for the weighted q ab
 for any weights, however much they and the lengths of edges differ.
 
 Steps.  A convex energy rounds a step, or closes it over an outlier.  So the weights m_e and n_i
-fall with the residuals, 1 / (1 + (r / k sigma)^2), taken anew ``reweightings`` times; for each set
+fall with the residuals, 1 / (1 + (r / k sigma)^2), recomputed ``reweightings`` times; for each set
 the convex problem is solved from where the last one ended, at first from planes averaged among
 neighbours that agree.  Before each set vertices that were outvoted at a step change to a
 neighbour's surface that agrees with their data, and those whose data agree with none (outliers)

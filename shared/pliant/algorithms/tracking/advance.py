@@ -98,7 +98,7 @@ def advance_tracks(
     templates: F32,
     scratch: F32,
 ) -> None:
-    """Move tracks on by one frame; ``alive`` says which survive.
+    """Move tracks by one frame; ``alive`` marks those that survive.
 
     kappa: curvature of this frame.  order: the rows, from ``scan_order``.  motions: (len(order), 2)
     and scratch: (TEMPLATE_FLOATS), both overwritten.

@@ -24,7 +24,7 @@ def chart(
     """An <svg>: one polyline for each line, thinned to what a screen shows.
 
     span: first and last place.   top: the value at the upper edge.   shaded: places of width 1.
-    says: what is drawn, the text at the upper edge, and that at the right end of the axis.
+    labels: what is drawn, the text at the upper edge, and that at the right end of the axis.
     """
     across = (_RIGHT - _LEFT) / max(span[1] - span[0], 1e-9)
     of, highest, end = labels

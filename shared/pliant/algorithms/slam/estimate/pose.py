@@ -47,7 +47,7 @@ class Spread(NamedTuple):
 
 
 class Correspondences(NamedTuple):
-    """Points and their observations in one image, and whatever else tells the pose of its camera.
+    """Points and their observations in one image, and any prior on the pose of its camera.
 
     points_world: (N, 3).   points_px: (N, 2), NaN where not seen.   weights: (N,) of the
     observations; None: all alike.   spread: of points with an uncertain depth, see
