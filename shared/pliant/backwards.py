@@ -117,7 +117,7 @@ def reach_back(
     """Read stretches of a source backwards, from which a map was made.
 
     known: that map.   history: of it, which becomes that of both: frames that have a pose keep it
-    but for what moves the map.   Raises DatasetError where the source has changed.
+    but for what moves the map.   Raises DatasetError if the source has changed.
     """
     rectifier = Rectifier(dataset.calibration)
     camera = rectifier.camera
@@ -253,7 +253,7 @@ def _as_jpeg(image: Image) -> tuple[bytes, bytes]:
 def _backwards(dataset: Dataset, numbers: Sequence[int], room: int) -> Iterator[SourceFrame]:
     """Frames by their numbers, which descend, ``room`` of them held at a time.
 
-    Raises DatasetError where the source does not have them any more.
+    Raises DatasetError if the source does not have them any more.
     """
     for begin in range(0, len(numbers), room):
         some = numbers[begin : begin + room]

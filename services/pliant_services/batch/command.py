@@ -158,7 +158,7 @@ def _named(sources: Sequence[Path]) -> list[tuple[Path, str]]:
 
 
 def _read(output: Path, options: list[str]) -> list[Clip] | None:
-    """The rows of a batch that was begun there with the same options; None where none was."""
+    """The rows of a batch that was begun there with the same options; None if none was."""
     path = output / SUMMARY_NAME
     if not path.exists():
         if output.exists() and (not output.is_dir() or any(output.iterdir())):

@@ -65,7 +65,7 @@ class Cluster:
     ) -> None:
         """Run all of them.  begun, over: called with the clip, the worker, and the outcome.
 
-        Ctrl-C cuts off those that run; raises KeyboardInterrupt then.  Raises BusError where the
+        Ctrl-C cuts off those that run; raises KeyboardInterrupt then.  Raises BusError if the
         scheduler goes away.
         """
         topic = f"pliant-batch-{uuid.uuid4().hex}"

@@ -125,7 +125,7 @@ class OneRun:
     """Its output goes to its log."""
 
     def __init__(self, arguments: list[str], log: Path, folder: Path) -> None:
-        """arguments: of ``pliant run``.  Raises OSError where the log cannot be written."""
+        """arguments: of ``pliant run``.  Raises OSError if the log cannot be written."""
         command = [sys.executable, "-m", "pliant_services.cli", "run", *arguments]
         with create(log) as file:
             self._process = subprocess.Popen(
@@ -139,7 +139,7 @@ class OneRun:
         self._log = log
 
     def wait(self, stopped: Callable[[], bool]) -> int | None:
-        """Its exit code; None where it was cut off, as it was to stop."""
+        """Its exit code; None if it was cut off, as it was to stop."""
         while True:
             try:
                 return self._process.wait(_LOOK_S)

@@ -81,7 +81,7 @@ class _Found:
 
 
 def check_file(output: Path, *, source: str, mask: Path | None, force: bool) -> None:
-    """Raise ResultError where the calibration cannot go there.  Changes nothing."""
+    """Raise ResultError if the calibration cannot go there.  Changes nothing."""
     if output.is_dir():
         raise ResultError(f"{output} is a folder: name a file, such as {output / 'calib.yaml'}")
     picture = picture_of(output)

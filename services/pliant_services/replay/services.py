@@ -50,7 +50,7 @@ def recorded_services(summary: Summary) -> list[str]:
 
 
 def require_inputs(summary: Summary, services: Sequence[Process]) -> None:
-    """Raise RecordingError where the recording lacks what services read of every frame."""
+    """Raise RecordingError if the recording lacks what services read of every frame."""
     needing = _lacking(summary, services, topics.IMAGE)
     if needing:
         raise RecordingError(

@@ -68,7 +68,7 @@ def has_ended(output: Path, services: Sequence[str], config: Config) -> bool:
 
 
 def check_ended(output: Path, config: Config) -> None:
-    """Raise ResultError where a run without checkpoints was not recorded to its end."""
+    """Raise ResultError if a run without checkpoints was not recorded to its end."""
     from pliant.results.surfels import has_surfels  # loads modules that a launcher does not need
 
     deformable = has_surfels(output / RECORDING_NAME)

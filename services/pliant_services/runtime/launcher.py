@@ -247,7 +247,7 @@ class Fleet:
         self._children[index] = self._spawn(child.name)
 
     def raise_if_died(self) -> None:
-        """Raise ServiceDiedError where a service has failed."""
+        """Raise ServiceDiedError if a service has failed."""
         first = first_to_fail(self._children)
         if first is not None:
             raise ServiceDiedError(first.obituary(), crashed=first.crashed)

@@ -53,11 +53,11 @@ class Relay:
         self._thread.start()
 
     def wait_for_viewer(self, timeout_s: float) -> bool:
-        """Wait until the first viewer has come; False where none does in time."""
+        """Wait until the first viewer has come; False if none does in time."""
         return self._seen.wait(timeout_s)
 
     def wait_for_last_viewer(self, timeout_s: float) -> bool:
-        """Wait until the last viewer has left; False where one is still there by then."""
+        """Wait until the last viewer has left; False if one is still there by then."""
         return self._alone.wait(timeout_s)
 
     def know_camera(self, camera: tuple[bytes, bytes]) -> None:

@@ -120,7 +120,7 @@ def _leave(state: Path | None, name: str) -> None:
 
 
 def _check_recording(output: Path, state: Path | None) -> None:
-    """Raise ResultError where the results cannot go there, or another session's are there."""
+    """Raise ResultError if the results cannot go there, or another session's are there."""
     if output.name != RECORDING_NAME:
         raise ResultError(f"{output}: --results needs a recording named {RECORDING_NAME}")
     own = state / "recorder" if state is not None else None

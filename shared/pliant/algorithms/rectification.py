@@ -136,7 +136,7 @@ def rectified_camera(lens: Lens) -> PinholeCamera:
     least 0.8 of the lens's own: a wide fisheye loses the rim of its view, so that the centre keeps
     its resolution.  No pixel of the result is made up.
 
-    Raises ValueError where the coefficients leave no usable image.
+    Raises ValueError if the coefficients leave no usable image.
     """
     if not lens.distorts:
         return lens.pinhole

@@ -64,7 +64,7 @@ def health_key(service: str) -> str:
 
 
 def read_health(sample: zenoh.Sample) -> tuple[str, Health] | None:
-    """The session and the health in a sample; None where it is not one of ours."""
+    """The session and the health in a sample; None if it is not one of ours."""
     if len(sample.payload) > MAX_BYTES:
         return None
     try:

@@ -103,7 +103,7 @@ class InLink:
             self.box.refuse(why)
 
     def look_into(self, received: Received, *, views: bool = False) -> Received:
-        """The message with what is in it.  Raises MessageError where it does not fit the topic."""
+        """The message with what is in it.  Raises MessageError if it does not fit the topic."""
         topic = topics.STREAM_END if received.is_end else self.topic
         message = codec.decode(topic.message, received.data, max_bytes=topic.max_bytes, views=views)
         if isinstance(message, StreamEnd) and received.is_end:
@@ -192,7 +192,7 @@ class OutLink:
 def received(topic: Topic, sample: zenoh.Sample) -> Received | None:
     """The messages that a mere listener receives: possibly twice, and not decoded.
 
-    None where it is no message of a bus.
+    None if it is no message of a bus.
     """
     envelope = sample.attachment.to_bytes() if sample.attachment is not None else b""
     if len(envelope) != ENVELOPE.size or len(sample.payload) > topic.max_bytes:

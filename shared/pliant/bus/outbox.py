@@ -86,7 +86,7 @@ class Outbox:
         return message
 
     def start_from(self, sequence: int) -> None:
-        """Go on from a number, as after a restart.  Nothing may have been added yet."""
+        """Continue from a number, as after a restart.  Nothing may have been added yet."""
         self.sent = sequence
 
     def credit(
@@ -189,7 +189,7 @@ class Outbox:
         return self.again(min(taken)) if taken else ()
 
     def again(self, sequence: int) -> tuple[Numbered, ...]:
-        """Everything from a number on.  Raises BusError where it is not kept any more."""
+        """Everything from a number on.  Raises BusError if it is not kept any more."""
         if sequence >= self.sent:
             return ()
         if not self._kept or self._kept[0].sequence > sequence:

@@ -147,8 +147,8 @@ class Peers:
             raise self.failure
 
     def raise_if_refused(self) -> None:
-        """Raise BusError where versions do not fit or a newer one of us is there, SessionOverError
-        where there is nothing to wait for any more; and what a thread of the bus failed of."""
+        """Raise BusError if versions do not fit or a newer one of us is there, SessionOverError
+        if there is nothing to wait for any more; and what a thread of the bus failed of."""
         self.raise_if_failed()
         if self.over:
             raise SessionOverError(f"{self.service}: the session is over")

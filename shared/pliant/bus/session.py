@@ -68,7 +68,7 @@ class Identity:
     def in_folder(cls, folder: Path, name: str) -> "Identity":
         """The identity ``name`` in a folder that ``pliant certs`` made.
 
-        Raises BusError where it is not there.
+        Raises BusError if it is not there.
         """
         own = cls(folder / "ca.pem", folder / f"{name}.pem", folder / f"{name}.key")
         for path in (own.authority, own.certificate, own.key):

@@ -90,7 +90,7 @@ class Waits:
                     self.spent_s[name] = self.spent_s.get(name, 0.0) + spent_s
 
     def for_message(self, entries: Sequence[InLink], deadline: float | None) -> InLink | None:
-        """The input whose message came first; None where none comes in time.  Raises BusError."""
+        """The input whose message came first; None if none comes in time.  Raises BusError."""
         with self.changed:
             self.peers.raise_if_failed()
             while not any(entry.box.waiting for entry in entries):

@@ -198,7 +198,7 @@ class ZenohBus:
 
         may_lag: readers in whose window it takes no room, where ``lags`` names them; with it no
         more than that is on the way to them.
-        Raises MessageError where the message is larger than its topic's readers take.
+        Raises MessageError if the message is larger than its topic's readers take.
         """
         payload = codec.encode(message, packed=topic in self._packed)
         if len(payload) > topic.max_bytes:

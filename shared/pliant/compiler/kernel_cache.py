@@ -58,7 +58,7 @@ class SourcesCache(FunctionCache):
     _impl_class = _Place
 
     def __init__(self, function: Any) -> None:
-        """Raises PliantError where no folder can be written."""
+        """Raises PliantError if no folder can be written."""
         try:
             super().__init__(function)
         except RuntimeError:  # of Numba, where no place will do
@@ -76,7 +76,7 @@ class SourcesCache(FunctionCache):
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """A kernel from disk; None where it is not there.
+        """A kernel from disk; None if it is not there.
 
         Numba registers all that a compiler may need first, a tenth of a second in every process:
         machine code needs the functions that count references, no more.  Who compiles registers

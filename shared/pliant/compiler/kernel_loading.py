@@ -14,7 +14,7 @@ import numba.core.codegen
 def parse_when_needed() -> None:
     """Have this process parse the intermediate code of loaded kernels only where it is linked.
 
-    Repeated calls do nothing.  Raises AttributeError where Numba loads kernels otherwise.
+    Repeated calls do nothing.  Raises AttributeError if Numba loads kernels otherwise.
     """
     library: Any = numba.core.codegen.JITCodeLibrary
     load, link = library._unserialize.__func__, library._get_module_for_linking

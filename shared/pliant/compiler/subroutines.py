@@ -14,7 +14,7 @@ from numba.core.base import BaseContext
 def keep_subroutines_apart() -> None:
     """Have kernels with other options compile subroutines of their own.
 
-    Repeated calls do nothing.  Raises AttributeError where Numba keeps subroutines otherwise.
+    Repeated calls do nothing.  Raises AttributeError if Numba keeps subroutines otherwise.
     """
     target: Any = BaseContext
     subtarget = target.subtarget

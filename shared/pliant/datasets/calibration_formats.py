@@ -69,7 +69,7 @@ def _keys(text: str) -> Keys:
 
 
 def _json(text: str) -> Any:
-    """None where it is none.  YAML reads JSON, too, but takes minutes for a thousand poses."""
+    """None if it is none.  YAML reads JSON, too, but takes minutes for a thousand poses."""
     if not text.lstrip().startswith("{"):
         return None
     try:
@@ -119,7 +119,7 @@ def _kalibr(content: Keys, wanted: Wanted) -> Keys:
 
 def _of_chain(cameras: Keys, wanted: Wanted) -> str:
     """Which camera of a chain took the images: the one the user names, or their topic or folder,
-    or their size.  Raises CalibrationError where none of them does."""
+    or their size.  Raises CalibrationError if none of them does."""
     names = list(cameras)
     if wanted.camera:
         named = [

@@ -57,7 +57,7 @@ class CameraDevice:
         open_device: Callable[[int], Capture] = _open_device,
         clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Raises DatasetError where there is no such camera, and CalibrationError.
+        """Raises DatasetError if there is no such camera, and CalibrationError.
 
         open_device, clock_ns: for tests.
         """

@@ -40,8 +40,8 @@ def with_depth(
 ) -> Sequence[ListedImage]:
     """The images with the depth maps that are wanted of them.
 
-    Raises DatasetError where there is no list or nothing in it belongs to an image, and
-    CalibrationError where the unit of the depth maps is not known.
+    Raises DatasetError if there is no list or nothing in it belongs to an image, and
+    CalibrationError if the unit of the depth maps is not known.
     """
     images = listed.images
     if spec.depth == "none":
@@ -117,7 +117,7 @@ class DepthRectifier:
         """(H, W) metres along the optical axis, 0 where nothing was measured.
 
         Pixels are taken as they are, the nearest one: between two surfaces there is nothing.
-        Raises BrokenFrame where the bytes are no depth map, or one of another size.
+        Raises BrokenFrame if the bytes are no depth map, or one of another size.
         """
         if self._depth is None:
             raise BrokenFrame(f"frame {frame}: a depth map without depth_scale in the calibration")

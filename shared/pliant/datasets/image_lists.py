@@ -122,7 +122,7 @@ def mended(
 ) -> tuple[list[ListedImage], list[str]]:
     """The images with increasing times, and a note where some did not increase.
 
-    Those become broken frames between the others.  Raises DatasetError where they are many.
+    Those become broken frames between the others.  Raises DatasetError if they are many.
     """
     stamps = [image.stamp_ns for image in images]
     good = set(increasing(stamps))
@@ -151,7 +151,7 @@ def mended(
 
 
 def inside(folder: Path, name: str, where: str) -> Path:
-    """The path of a listed file.  Raises DatasetError where it would leave the folder."""
+    """The path of a listed file.  Raises DatasetError if it would leave the folder."""
     normal = os.path.normpath(name)
     if "\0" in name or os.path.isabs(name) or normal.split(os.sep)[0] == "..":
         raise DatasetError(

@@ -129,7 +129,7 @@ def _read(path: Path) -> BoolArray:
 
 
 def _numbered(folder: Path, files: list[Path], frames: int | None) -> dict[int, Path]:
-    """Masks by the number of their frame.  Raises DatasetError where two have the same."""
+    """Masks by the number of their frame.  Raises DatasetError if two have the same."""
     found: dict[int, Path] = {}
     for file in files:
         digits = re.findall(r"[0-9]+", file.stem)

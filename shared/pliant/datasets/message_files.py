@@ -38,7 +38,7 @@ class OpenMessages(Protocol):
     topics: list[MessageTopic]
 
     def messages(self, topic: MessageTopic) -> Iterator[RecordedImage]:
-        """The messages of one topic in order of time.  Raises DatasetError where they end badly."""
+        """The messages of one topic in order of time.  Raises DatasetError if they end badly."""
         ...
 
 
@@ -48,7 +48,7 @@ class MessageFile(Protocol):
     path: Path
 
     def open(self) -> AbstractContextManager[OpenMessages]:
-        """Open it.  Raises DatasetError where it is damaged or a library is missing."""
+        """Open it.  Raises DatasetError if it is damaged or a library is missing."""
         ...
 
 
@@ -76,7 +76,7 @@ class MessageImages:
         self.frame_count = self._topic.count if self._topic.count >= 0 else None
 
     def __iter__(self) -> Iterator[SourceFrame]:
-        """Raises DatasetError where the file is damaged or has fewer messages than it announces."""
+        """Raises DatasetError if the file is damaged or has fewer messages than it announces."""
         came = 0
         with self._file.open() as opened:
             for frame in in_order(self._frames(opened), ahead=not self.is_live):

@@ -104,7 +104,7 @@ class VideoDecoder:
 
 @contextlib.contextmanager
 def opened(file: Path) -> Generator[VideoDecoder, None, None]:
-    """The decoder of the stream that is meant.  Raises DatasetError where a file has none."""
+    """The decoder of the stream that is meant.  Raises DatasetError if a file has none."""
     try:
         chosen = choose(streams_of(file))
     except OSError as error:
@@ -139,7 +139,7 @@ def quiet_opencv() -> Generator[None, None, None]:
 def _start(
     file: Path, chosen: ChosenStream, held: contextlib.ExitStack, *, raw: bool = False
 ) -> cv2.VideoCapture | None:
-    """OpenCV's reader at the first picture, or at the first packet; None where there is none.
+    """OpenCV's reader at the first picture, or at the first packet; None if there is none.
 
     A name with a colon is none of a protocol, and one that is not UTF-8 never comes to OpenCV.
     """

@@ -69,7 +69,7 @@ class Container:
 
 @dataclass(frozen=True, kw_only=True)
 class ChosenStream:
-    """The decoded stream of a file.  stream: None where the container is not understood."""
+    """The decoded stream of a file.  stream: None if the container is not understood."""
 
     stream: VideoStream | None = None
     patches: tuple[Patch, ...] = ()
@@ -108,7 +108,7 @@ def _note(streams: Sequence[VideoStream], chosen: VideoStream) -> str:
 def streams_of(file: Path) -> Container:
     """The video streams of an MP4, MOV, Matroska or WebM file; none of any other.
 
-    Raises OSError where the file cannot be read.
+    Raises OSError if the file cannot be read.
     """
     from pliant.datasets import matroska, mp4_boxes
 

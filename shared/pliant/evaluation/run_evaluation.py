@@ -217,7 +217,7 @@ class _Accuracy:
 def _other_segments(trajectory: Trajectory, report: RunReport, path: Path) -> list[int]:
     """Poses in each segment of report.json but the longest, which is the trajectory.
 
-    Raises ResultError where the trajectory is not the longest of them.
+    Raises ResultError if the trajectory is not the longest of them.
     """
     counts = sorted(segment.frames for segment in report.segments or () if segment.frames)
     if report.segments is not None and len(trajectory) != (counts[-1] if counts else 0):

@@ -55,7 +55,7 @@ def surface_columns(
     samples: F64, floor: F64, true: F64, diameter_m: float
 ) -> dict[str, SurfaceFigures]:
     """Figures by column.  Samples (N, 3) of a mesh and (K, 3) of the true depth at its poses, both
-    aligned by the trajectory; (M, 3) of the true surface.  None where one of them is empty."""
+    aligned by the trajectory; (M, 3) of the true surface.  None if one of them is empty."""
     if not (len(samples) and len(floor) and len(true)):
         return {}
     still = Similarity(scale=1.0, R=np.eye(3), t=np.zeros(3))

@@ -33,7 +33,7 @@ def geojson(recording: Recording, path: Path, folder: Path | None) -> None:
 
 
 def _track(recording: Recording) -> tuple[EarthTrack, GpsFit]:
-    """Raises ResultError where the run has no poses, or its source no fixes that place them."""
+    """Raises ResultError if the run has no poses, or its source no fixes that place them."""
     run = read_run(recording.path)
     history = run.history
     longest = history.longest_segment()

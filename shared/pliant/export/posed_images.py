@@ -66,7 +66,7 @@ class IdealCamera:
     """
 
     def __init__(self, run: Run) -> None:
-        """Raises ResultError where there is no map."""
+        """Raises ResultError if there is no map."""
         self.segment = run.history.longest_segment()
         poses = {**run.history.final(), **run.history.keyframe_poses()}
         self.poses = {f: pose_to_matrix(p) for f, (s, p) in poses.items() if s == self.segment}
@@ -121,7 +121,7 @@ def write_posed_images(
     of all into ``masks`` beside it: black where it is ignored, white of those that have none, as
     nerfstudio takes masks of all images or of none.
 
-    mask_name: of its file, by the name of the image.    Raises ResultError where there are no
+    mask_name: of its file, by the name of the image.    Raises ResultError if there are no
     images, and where the disk fails.
     """
     make_folder(folder)

@@ -25,10 +25,10 @@ class Recorded:
     data: bytes
     publish_time_ns: int = 0
     checked: bool = True
-    """False where it comes from a chunk that was cut off, so that no checksum vouches for it."""
+    """False if it comes from a chunk that was cut off, so that no checksum vouches for it."""
 
     def decode(self) -> Header:
-        """The message.  Raises MessageError where its bytes are not what its topic carries."""
+        """The message.  Raises MessageError if its bytes are not what its topic carries."""
         return codec.decode(self.topic.message, self.data, max_bytes=self.topic.max_bytes)
 
     def write_to(self, writer: RecordingWriter) -> None:
@@ -45,7 +45,7 @@ class Recording:
     def __init__(self, path: Path) -> None:
         """``path``: a file, or the name or folder of one in parts.
 
-        Raises RecordingError where there is no such file.
+        Raises RecordingError if there is no such file.
         """
         self.files = parts_of(path)
         """The files that it consists of, in order."""

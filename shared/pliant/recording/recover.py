@@ -50,7 +50,7 @@ def recover(damaged: Path, output: Path, *, keep: Callable[[Recorded], bool] = d
     """Copy everything that is intact into a new recording, which appears whole or not at all.
 
     Chunks count by their checksums, and in them the messages that ``keep`` selects.  Raises
-    RecordingError where nothing can be read or written.
+    RecordingError if nothing can be read or written.
     """
     partial = output.with_name(output.name + ".partial")
     recovery = Recovery()

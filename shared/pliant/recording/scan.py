@@ -387,7 +387,7 @@ def _parsed(read: Callable[[ReadDataStream], _R], content: bytes) -> _R | None:
 
 
 def _passed(records: Source, size: int) -> bool:
-    """Skip that many bytes; False where there are fewer."""
+    """Skip that many bytes; False if there are fewer."""
     while size > 0:
         block = records.read(min(size, BLOCK_BYTES))
         if not block:

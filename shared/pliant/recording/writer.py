@@ -45,7 +45,7 @@ class RecordingWriter:
     ) -> None:
         """Create the file.  ``metadata`` is written first: the resolved config, versions, host.
 
-        replace: an earlier file of this name.  Raises RecordingError where the file cannot be
+        replace: an earlier file of this name.  Raises RecordingError if the file cannot be
         created.
         """
         self._path = path

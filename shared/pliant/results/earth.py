@@ -17,7 +17,7 @@ def place_on_earth(
     """The similarity from the world of a trajectory to the Earth.   oriented: else its scale alone.
 
     run: of the trajectory; where it is level, its z is up.
-    Raises ResultError where the fixes do not determine it, or there are none.
+    Raises ResultError if the fixes do not determine it, or there are none.
     """
     fixes = fixes_of(recording)
     if not len(fixes.stamps_ns):

@@ -152,7 +152,7 @@ def _finish_switch(output: Path) -> None:
 def written(output: Path, *, force: bool) -> Generator[Held]:
     """Hold a result folder while results are written to it; made here, it goes if it stays empty.
 
-    Raises ResultError where the results cannot go there, or another process is writing them.
+    Raises ResultError if the results cannot go there, or another process is writing them.
     """
     check_output(output, force=force)
     missing = [folder for folder in (output, *output.parents) if not folder.exists()]
@@ -184,7 +184,7 @@ def written(output: Path, *, force: bool) -> Generator[Held]:
 def recorded_into(folder: Path) -> Generator[None]:
     """Hold the folder of a recording against those who would replace what is there.
 
-    Others may record into it beside us.  Raises ResultError where results are written to it.
+    Others may record into it beside us.  Raises ResultError if results are written to it.
     """
     settle_killed(folder)
     try:
@@ -204,7 +204,7 @@ def is_being_written(output: Path) -> bool:
 
 
 def check_free(*folders: Path, elsewhere: bool = True) -> None:
-    """Raise ResultError where another process writes to one of these folders.
+    """Raise ResultError if another process writes to one of these folders.
 
     elsewhere: whether the command has an --output that can name another one.
     """
@@ -217,7 +217,7 @@ def check_free(*folders: Path, elsewhere: bool = True) -> None:
 
 
 def check_output(output: Path, *, force: bool) -> None:
-    """Raise ResultError where the results cannot go there.  Changes nothing."""
+    """Raise ResultError if the results cannot go there.  Changes nothing."""
     try:
         if output.exists() and not output.is_dir():
             raise ResultError(f"{output} is a file: choose another --output")
@@ -306,7 +306,7 @@ def _settle(output: Path) -> None:
 def has_frames(output: Path) -> bool:
     """Whether anything of a frame is recorded, of which more may be made, though it is damaged.
 
-    Raises RecordingError where that cannot be known.
+    Raises RecordingError if that cannot be known.
     """
     for part in parts.parts_of(output / RECORDING_NAME):
         with suppress(NothingReadableError):

@@ -26,7 +26,7 @@ class Held:
     def __init__(self, output: Path, kind: int = fcntl.LOCK_EX) -> None:
         """kind: LOCK_EX, or LOCK_SH for several holders.
 
-        Raises ResultError where another process holds it, OSError where it cannot be written to.
+        Raises ResultError if another process holds it, OSError if it cannot be written to.
         """
         self._name = output
         self._folder = os.open(output, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)

@@ -33,7 +33,7 @@ def meshes_of(pieces: Sequence[MeshPiece]) -> dict[tuple[int, str], list[MeshPie
 
 
 def mesh_of(pieces: Sequence[MeshPiece], segment: int) -> TriangleMesh | None:
-    """The fine one of a segment, None where it is not there."""
+    """The fine one of a segment, None if it is not there."""
     found = meshes_of(pieces).get((segment, "fine"))
     return None if found is None else joined(found)
 
@@ -91,7 +91,7 @@ def place_of(recording: Path, folder: Path) -> dict[str, str]:
 def run_of(folder: Path) -> Path:
     """The result folder of the run: that of a folder of ``pliant mesh``, else the folder itself.
 
-    Raises ResultError where the report does not name a recording that is there.
+    Raises ResultError if the report does not name a recording that is there.
     """
     report = folder / MESHED_NAME
     if not report.is_file():

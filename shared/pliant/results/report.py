@@ -176,7 +176,7 @@ def _well_observed(run: Run, final: dict[int, Any]) -> int:
 
 
 def _known_map(run: Run, final: dict[int, Any]) -> dict[str, Any] | None:
-    """How the run found its way in the map of earlier sessions; None where it had none.
+    """How the run found its way in the map of earlier sessions; None if it had none.
 
     looked: frames before the first that was in it as it came, by itself or as its segment joined.
     """

@@ -95,7 +95,7 @@ class Run:
     @property
     def focal_range(self) -> tuple[float, float] | None:
         """The least and the greatest focal length, in units of the calibration that was found, but
-        for a twentieth of the keyframes at each end; None where it does not change."""
+        for a twentieth of the keyframes at each end; None if it does not change."""
         if not any(self.log_focals.values()):
             return None
         low, high = np.exp(np.percentile([*self.log_focals.values()], (5.0, 95.0))).tolist()

@@ -19,7 +19,7 @@ class RosError(PliantError):
 
 @cache
 def definitions() -> Any:
-    """rosbags' store of types.  Raises RosError where rosbags is missing."""
+    """rosbags' store of types.  Raises RosError if rosbags is missing."""
     try:
         typesys: Any = importlib.import_module("rosbags.typesys")
     except ImportError:

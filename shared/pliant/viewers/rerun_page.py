@@ -43,7 +43,7 @@ class RerunPage:
         """Take the port.
 
         behind: the port at which Rerun's program has its page.    data: what it shows.
-        Raises ResultError where the port is taken.
+        Raises ResultError if the port is taken.
         """
         token = secrets.token_urlsafe()
         root = f"http://localhost:{port}/{token}"

@@ -126,7 +126,7 @@ def smooth(
     same for any order of the points.    start_from: its surface gives the weights at once, so one
     set of weights is enough.
 
-    Raises ValueError where sizes differ.
+    Raises ValueError if sizes differ.
     """
     M, E = len(points_px), len(edges)
     if inverse_depths.shape != (M,) or sigmas.shape != (M,):

@@ -18,7 +18,7 @@ _TRUTH = "<!-- against the truth -->"
 def fill_page(path: Path, report: dict[str, Any], names: Container[str], **parts: str) -> None:
     """Write a page.  names: of the files beside it.  parts: HTML by its place in page.html.
 
-    Raises ResultError where the disk fails.
+    Raises ResultError if the disk fails.
     """
     text = Template(_part("page.html")).substitute(
         title=escape(report["source"] or "a run"),

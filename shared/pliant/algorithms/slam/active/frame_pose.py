@@ -76,7 +76,7 @@ def locate_in_map(
     """Return T_world_camera of a frame, and the place if its image shows another one than its
     tracks.
 
-    active, motion: None where the camera is not in the map yet.   recognise: the place by the
+    active, motion: None if the camera is not in the map yet.   recognise: the place by the
     image.   Firm tracks need no image; the pose of a few counts if the image shows no other place.
     """
     there = None

@@ -106,7 +106,7 @@ def relative_poses(points_a: F64, points_b: F64, *, gate: float) -> list[Relativ
 
 
 def likely_pose(points_a: F64, points_b: F64, *, gate: float) -> RelativePose | None:
-    """One of ``relative_poses``, in a tenth of the time and not always the best; None where there
+    """One of ``relative_poses``, in a tenth of the time and not always the best; None if there
     is none."""
     if len(points_a) < 8:
         return None
