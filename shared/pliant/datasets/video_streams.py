@@ -5,14 +5,10 @@ are hidden from it: a few bytes of the header are replaced while it reads (``Pat
 """
 
 import io
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
-
-_AVI = b"RIFF"
-"""AVI has one size for all its frames, and no times of them but their order of decoding."""
 
 
 @dataclass(frozen=True)
@@ -103,23 +99,6 @@ def _note(streams: Sequence[VideoStream], chosen: VideoStream) -> str:
     )
     number = next(i for i, each in enumerate(streams, start=1) if each is chosen)
     return f"{len(streams)} video streams ({listed}): reading stream {number}"
-
-
-def streams_of(file: Path) -> Container:
-    """The video streams of an MP4, MOV, Matroska or WebM file; none of any other.
-
-    Raises OSError if the file cannot be read.
-    """
-    from pliant.datasets import matroska, mp4_boxes
-
-    with file.open("rb") as source:
-        size = source.seek(0, os.SEEK_END)
-        for kind in (mp4_boxes, matroska):
-            source.seek(0)
-            if kind.recognises(source.read(kind.MAGIC_BYTES)):
-                return kind.video_streams(source, size)
-        source.seek(0)
-        return Container(may_change=source.read(len(_AVI)) != _AVI)
 
 
 class PatchedFile(io.BufferedIOBase):
