@@ -16,10 +16,10 @@ DOUBTS = 0.25
 """Share of doubtful poses above which a run is.  Good sequences have up to a sixth."""
 
 _FOLLOWED = 0.75
-"""Share of the surfels in view with which a frame is followed well.  Nine tenths of the frames of
-sequences with ground truth that surfels stay on have 0.84 and more (cloth, sheets that slide,
-breathing
-tissue behind an instrument); where an instrument tears tissue about, half of them have 0.67."""
+"""Share of the surfels in view that are tracked in a good frame.  In sequences with ground truth
+that are tracked well, nine tenths of the frames have 0.84 and more (cloth, sliding sheets,
+breathing tissue behind an instrument).  With an instrument that pulls tissue, half of them have
+0.67."""
 
 
 def doubtful_frames(history: MapHistory) -> list[int]:
@@ -39,7 +39,8 @@ def judge(
 
     frames: all, except those that a mask covers.   in_segments: poses in each segment of the map.
     doubtful: poses with that flag.   broken: frames that do not decode or have a wrong time.
-    absent: frames of the source that never came.   behind: frames without a pose for lack of time.
+    absent: announced frames of the source that never came.   behind: frames without a pose for lack
+    of time.
     by_gyro: frames that no image places, but the gyro between others.
     calibration: why it bends the map; "" if it does not.   focal: how the focal length changes
     during the clip; "" if it does not.   failed: the source broke off.

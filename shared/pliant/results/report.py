@@ -98,7 +98,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
 
 
 def last_reason(reasons: Sequence[str]) -> str:
-    """The last of the reasons why frames have no pose, or what most images look like."""
+    """The last reason why frames have no pose, or the common fault of most images."""
     for flaw in FLAWS:
         count = reasons.count(flaw)
         if 2 * count > len(reasons):
@@ -135,7 +135,7 @@ def process_figures(run: Run, frames: int) -> dict[str, Any]:
 
 
 def absent_frames(run: Run, came: int) -> int:
-    """Frames that the source announced and that never came."""
+    """Number of frames that the source announced and that never came."""
     announced = -1 if run.stream is None else run.stream.frames
     # Containers of videos count their frames roughly.
     roughly = 0 if run.source_failure else max(2, _ROUGHLY * announced)
@@ -143,7 +143,7 @@ def absent_frames(run: Run, came: int) -> int:
 
 
 def source_failed(run: Run) -> bool:
-    """Whether the source broke off.  A live one has no end of its own."""
+    """Whether the source ended early.  A live source has no end of its own."""
     return bool(run.source_failure) and run.stream is not None and run.stream.mode != "live"
 
 
