@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pliant.trajectory import Trajectory as Trajectory
 
 arithmetic.fix()
-# FFmpeg is silent: our own line says what is wrong with a video.  Read at OpenCV's first one.
+# FFmpeg is silent, because our own messages describe a broken video.  OpenCV reads this once.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 _WHERE = {

@@ -117,7 +117,7 @@ def reach_back(
     """Read stretches of a source backwards, from which a map was made.
 
     known: that map.   history: of it, which becomes that of both: frames that have a pose keep it
-    but for what moves the map.   Raises DatasetError where the source has changed.
+    but for what moves the map.   Raises DatasetError if the source has changed.
     """
     rectifier = Rectifier(dataset.calibration)
     camera = rectifier.camera
@@ -127,22 +127,22 @@ def reach_back(
     numbers = [n for each in stretches for n in range(each.last, each.first - 1, -1)]
     room = max(1, _HELD_BYTES // (4 * camera.width * camera.height))
     first_ns, found = history.stamps_ns[numbers[0]], Reached()
-    told = _Told(history, numbers, found)
+    collected = _Collected(history, numbers, found)
     for number, source in enumerate(_backwards(dataset, numbers, room)):
         if source.stamp_ns != history.stamps_ns[source.index]:
             raise DatasetError(f"{dataset.name}: has changed since the first pass")
         image = rectified(source, rectifier)
         if image.missing:
-            told.take(mapper.skip(number))
+            collected.take(mapper.skip(number))
             continue
         stamp_ns, clearance = first_ns - image.stamp_ns, clearance_in(image.mask)
         tracks = tracker.track(image.grey, stamp_ns, clearance=clearance)
         colour = image.colour if image.colour.size else None
         grey = filled(image.grey, clearance)
-        told.take(mapper.process(Frame(number, stamp_ns, tracks, grey, colour)))
-        told.take_keyframes(mapper.publish_keyframes(), number, image, mapper.waiting_frames)
-    told.take(mapper.finish())
-    told.take_keyframes(mapper.publish_keyframes())
+        collected.take(mapper.process(Frame(number, stamp_ns, tracks, grey, colour)))
+        collected.take_keyframes(mapper.publish_keyframes(), number, image, mapper.waiting_frames)
+    collected.take(mapper.finish())
+    collected.take_keyframes(mapper.publish_keyframes())
     session = max(each.session for each in known)
     for each in map(_reversed, mapper.kept()):
         if each.session > session:  # it is of the same session as the first pass
@@ -151,7 +151,7 @@ def reach_back(
     return found
 
 
-class _Told:
+class _Collected:
     """Collects the output of a mapper for frames that are numbered in reading order."""
 
     def __init__(self, history: MapHistory, numbers: Sequence[int], found: Reached) -> None:
@@ -203,9 +203,9 @@ class _Told:
         self._images = {f: kept for f, kept in self._images.items() if f in waiting}
         ends = np.cumsum(delta.counts)
         for row, keyframe in enumerate(delta.keyframe_ids.tolist()):
-            told = slice(int(ends[row] - delta.counts[row]), int(ends[row]))
+            collected = slice(int(ends[row] - delta.counts[row]), int(ends[row]))
             seen = self._found.keyframes.setdefault(keyframe, MadeKeyframe())
-            seen.point_ids, seen.points_px = delta.point_ids[told], delta.points_px[told]
+            seen.point_ids, seen.points_px = delta.point_ids[collected], delta.points_px[collected]
 
 
 def final_update(before: MapHistory, after: MapHistory, last: MapDelta) -> MapDelta:
@@ -253,7 +253,7 @@ def _as_jpeg(image: Image) -> tuple[bytes, bytes]:
 def _backwards(dataset: Dataset, numbers: Sequence[int], room: int) -> Iterator[SourceFrame]:
     """Frames by their numbers, which descend, ``room`` of them held at a time.
 
-    Raises DatasetError where the source does not have them any more.
+    Raises DatasetError if the source does not have them any more.
     """
     for begin in range(0, len(numbers), room):
         some = numbers[begin : begin + room]

@@ -236,8 +236,8 @@ class MapHistory(CurrentMap):
                 delta.poses_keyframe_camera[row],
                 int(delta.pose_inliers[row]),
             )
-        told = [(old, new) for old, new in delta.same_places.tolist() if new >= 0]
-        self.same_places += [pair for pair in told if pair not in self.same_places]
+        pairs = [(old, new) for old, new in delta.same_places.tolist() if new >= 0]
+        self.same_places += [pair for pair in pairs if pair not in self.same_places]
         if final:
             return
         self.stamps_ns[frame] = stamp_ns

@@ -56,7 +56,7 @@ class Constants(Protocol):
         ...
 
     def kept(self, name: str) -> Any:
-        """The record of this name.  Raises StateError where there is none."""
+        """The record of this name.  Raises StateError if there is none."""
         ...
 
 

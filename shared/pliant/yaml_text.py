@@ -55,5 +55,5 @@ def _size(node: yaml.Node, known: dict[int, int], depth: int) -> int:
 
 
 def _line(error: Exception) -> str:
-    said = " ".join(str(error).split())
-    return said if len(said) <= 200 else f"{said[:197]}..."
+    text = " ".join(str(error).split())
+    return text if len(text) <= 200 else f"{text[:197]}..."

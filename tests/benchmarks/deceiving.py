@@ -124,11 +124,13 @@ class _Session:
 
 def run(deceiver: Deceiver, config: Config, seed: int) -> Iterator[tuple[str, Run]]:
     """Map a deceiver, and come back to it from the dark by each of its ways."""
-    session = _Session(Film(deceiver, seed), config, seed)
+    film = Film(deceiver, seed)
+    session = _Session(film, config, seed)
     session.see(deceiver.there)
     night = len(session.truth)
     session.be_in_the_dark()
-    film = Film(deceiver.after_the_dark(), seed)
+    if deceiver.moved_m:
+        film = Film(deceiver.after_the_dark(), seed)
     for name, way in deceiver.again.items():
         one = session.part(film)
         one.see(way)

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from running import NO_MESH, TINY, assert_one_line, in_this_process, pliant
+from running import COARSE_MESH, NO_MESH, TINY, assert_one_line, in_this_process, pliant
 
 from pliant.config import config_yaml, load_config, recorded_config
 from pliant.errors import ConfigError, RecordingError
@@ -26,7 +26,7 @@ PIPELINE = ["tracking", "bundle_adjustment"]
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recorded") / "tiny"
-    done = pliant("run", f"{TINY}?frames=12", "--output", folder, "--set", "seed=3")
+    done = pliant("run", f"{TINY}?frames=12", "--output", folder, "--set", "seed=3", *COARSE_MESH)
     assert (folder / "recording.mcap").exists(), done.stderr
     return folder
 
@@ -97,7 +97,7 @@ def test_a_changed_parameter_is_named_by_what_it_changes_first(
 
 def test_the_recorded_configuration_is_the_default(result: Path) -> None:
     summary = summarise(result / "recording.mcap")
-    assert recorded_config(summary.metadata, []) == load_config(None, ["seed=3"])
+    assert recorded_config(summary.metadata, []) == load_config(None, ["seed=3", COARSE_MESH[1]])
     assert recorded_config(summary.metadata, ["seed=4"]).seed == 4
     assert config_yaml(recorded_config(summary.metadata, [])) == summary.metadata["config"]["yaml"]
     with pytest.raises(ConfigError):
@@ -158,13 +158,7 @@ def without(result: Path, output: Path, *left_out: Topic, frame: int | None = No
                 assert isinstance(end, StreamEnd)
                 about = by_key(end.topic)
             if about not in left_out or frame not in (None, message.sequence):
-                writer.write(
-                    message.topic,
-                    message.data,
-                    sequence=message.sequence,
-                    log_time_ns=message.log_time_ns,
-                    publish_time_ns=message.publish_time_ns,
-                )
+                message.write_to(writer)
     return output
 
 

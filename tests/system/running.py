@@ -31,6 +31,8 @@ not.  A command that forgot to fix its arithmetic would not be seen otherwise.""
 UP = "services are up"
 NO_MESH = ("--set", "meshing.enabled=false")
 """For tests of what does not end in a mesh: a process and a third of a run's work less."""
+COARSE_MESH = ("--set", "meshing.tsdf.fine_voxel=0.03")
+"""For tests of what has a mesh, whatever its detail: a quarter of a run's work less."""
 FILES = ("trajectory.txt", "trajectory_online.txt", "keyframes.txt", "points.ply")
 """Of a run's results, those that depend on nothing but its input."""
 

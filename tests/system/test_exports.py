@@ -397,11 +397,11 @@ def test_points_that_were_missed_are_right_after_the_next_snapshot() -> None:
         told = np.array(sorted(window if snapshot else window & set(new.tolist())), np.int64)
         xyz = np.array([alive[i] for i in told.tolist()], np.float32).reshape(-1, 3)
         rgb = np.zeros((len(told), 3), np.uint8)
-        full.tell(told, xyz, rgb, 0 * told, np.sort(removed), snapshot=snapshot)
+        full.update(told, xyz, rgb, 0 * told, np.sort(removed), snapshot=snapshot)
         if step % 60 in (7, 8, 9):
             holey.miss()
         else:
-            holey.tell(told, xyz, rgb, 0 * told, np.sort(removed), snapshot=snapshot)
+            holey.update(told, xyz, rgb, 0 * told, np.sort(removed), snapshot=snapshot)
         if snapshot:
             theirs = {tuple(row) for row in holey.everything()[0].tolist()}
             true = {tuple(row) for row in full.everything()[0].tolist()}

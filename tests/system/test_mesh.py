@@ -8,7 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from running import TINY, assert_one_line, children, digests, in_this_process, pliant, running
+from running import (
+    COARSE_MESH,
+    TINY,
+    assert_one_line,
+    children,
+    digests,
+    in_this_process,
+    pliant,
+    running,
+)
 
 from pliant.export.export import export_result
 from pliant.formats.ply import read_ply
@@ -132,7 +141,7 @@ def test_a_mesh_made_again_is_evaluated_with_the_poses_of_its_run(
 ) -> None:
     (tmp_path / "made").mkdir()
     run = shutil.copytree(result, tmp_path / "made" / "run")
-    done = pliant("mesh", run, "--set", "meshing.depth=points")
+    done = pliant("mesh", run, "--set", "meshing.depth=points", *COARSE_MESH)
     assert done.returncode == 0, done.stderr
     moved = (tmp_path / "made").rename(tmp_path / "moved")
     meshed = moved / "run_mesh"

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from running import NO_MESH, TINY, assert_one_line, digests, in_this_process, pliant
+from running import COARSE_MESH, NO_MESH, TINY, assert_one_line, digests, in_this_process, pliant
 
 from pliant.datasets.builtin import builtin_folder
 from pliant.datasets.source_spec import SourceSpec
@@ -34,7 +34,7 @@ def late(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
         image = cv2.imread(str(path))
         assert image is not None
         cv2.imwrite(str(path), generator.integers(0, 256, image.shape[:2], np.uint8))
-    done = pliant("run", source, "--output", output)
+    done = pliant("run", source, *COARSE_MESH, "--output", output)
     assert done.returncode == 0, done.stderr
     shutil.copytree(builtin_folder(TINY) / "images", source / "images", dirs_exist_ok=True)
     return source, output

@@ -13,7 +13,7 @@ from urllib.request import Request, urlopen
 import numpy as np
 import pytest
 from benchmarks.viewer_cost import run_with
-from running import command, in_this_process, pliant
+from running import COARSE_MESH, NO_MESH, TINY, command, in_this_process, pliant
 
 from pliant.bus.session import free_endpoint
 from pliant.datasets.source_spec import SourceSpec
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.system
 def test_a_run_is_shown_live_and_afterwards(tmp_path: Path) -> None:
     rr = pytest.importorskip("rerun")
     result, live, after = tmp_path / "tiny", tmp_path / "live.rrd", tmp_path / "after.rrd"
-    done = pliant("run", "built-in:tiny", "--output", result, "--save", live)
+    done = pliant("run", TINY, "--output", result, "--save", live, *COARSE_MESH)
     assert done.returncode == 0, done.stderr
     assert f"pliant view {result}" in done.stderr
     assert not (result / "session.json").exists()
@@ -235,7 +235,7 @@ def test_a_browser_that_comes_late_gets_the_beginning_and_what_follows(
 def test_a_run_that_a_browser_looks_on_at_gives_its_results_and_stays(tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     with subprocess.Popen(
-        command("run", "built-in:tiny", "--view", "web", "--output", tmp_path / "tiny"),
+        command("run", TINY, "--view", "web", "--output", tmp_path / "tiny", *NO_MESH),
         stderr=subprocess.PIPE,
         text=True,
     ) as run:

@@ -93,6 +93,29 @@ def test_imports_go_one_way() -> None:
     assert not breaches
 
 
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    """Also not inside their functions."""
+    paths = {
+        ".".join(path.relative_to(root.parent).with_suffix("").parts).removesuffix(
+            ".__init__"
+        ): path
+        for root in (LIBRARY, SERVICES)
+        for path in python_files(root)
+    }
+    below: dict[str, set[str]] = {}
+    for name, path in paths.items():
+        below[name] = set(imports(path)) - {"pliant"}
+        for node in nodes(path):
+            if isinstance(node, ast.ImportFrom):
+                below[name] |= {f"{node.module}.{alias.name}" for alias in node.names}
+                if all(f"{node.module}.{alias.name}" in paths for alias in node.names):
+                    below[name].discard(str(node.module))  # only modules inside the package
+    while free := [name for name, found in below.items() if not found & below.keys()]:
+        for name in free:
+            del below[name]
+    assert not below
+
+
 SLAM_LAYERS = (
     *("estimate", "parameters", "keyframe_rule", "map", "calibration", "locate", "frame"),
     *("adjust", "start", "places", "store", "active", "journal", "atlas"),

@@ -81,9 +81,12 @@ def test_a_lesser_processor_makes_the_same_of_the_reference() -> None:
     That they do the same on each processor with AVX2 only an emulated one can tell.
     """
     topics, with_what = json.loads(_answer(_REFERENCE, {**_LESSER, **_C_LIBRARY}))
-    assert topics == reference.replay(_RECORDING)["topics"]
-    ours = arithmetic.in_force()
-    assert {name for name in ours if with_what[name] != ours[name]} == {"numpy"}
+    ours = json.loads(_RECORDING.with_name(reference.EXPECTED).read_text(encoding="utf-8"))
+    if ours["fingerprint"] != reference.fingerprint():  # else test_reference.py compares the bytes
+        ours = reference.replay(_RECORDING)
+    assert topics == ours["topics"]
+    in_force = arithmetic.in_force()
+    assert {name for name in in_force if with_what[name] != in_force[name]} == {"numpy"}
 
 
 @_FIXED

@@ -83,23 +83,23 @@ def test_requested_messages_that_arrived_meanwhile_are_not_sent_again() -> None:
     outbox.credit("b", 1, 6, 6)
     outbox.asking.add("a")
     outbox.credit("a", 1, 5, 5)
-    assert [m.sequence for m in outbox.asked_for()] == [5]
-    assert outbox.asked_for() == ()
+    assert [m.sequence for m in outbox.take_requested()] == [5]
+    assert outbox.take_requested() == ()
     outbox.asking.add("a")
     outbox.credit("a", 1, 6, 6)
-    assert outbox.asked_for() == ()
+    assert outbox.take_requested() == ()
 
 
 def test_a_long_wait_is_reported_with_its_length() -> None:
     waiting = Waiting()
-    assert waiting.told(now=100.0) == ""
+    assert waiting.description(now=100.0) == ""
     waiting.begin("an image", now=100.0)
-    assert waiting.told(now=101.0) == "an image"
+    assert waiting.description(now=101.0) == "an image"
     waiting.begin("an image from afar", now=103.0)  # the same wait
-    assert waiting.told(now=105.0) == "an image from afar, for 5 s"
+    assert waiting.description(now=105.0) == "an image from afar, for 5 s"
     waiting.end()
     waiting.begin("an image", now=106.0)
-    assert waiting.told(now=107.0) == "an image"
+    assert waiting.description(now=107.0) == "an image"
 
 
 def test_who_lacks_what_is_named() -> None:

@@ -6,6 +6,7 @@ import io
 import re
 import tokenize
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,8 @@ BANNED = {
     r"so many(?! \w+ that| that)": "this many, that many",
 }
 
+ANY_BANNED = re.compile(rf"\b(?:{'|'.join(BANNED)})(?!\w)", re.IGNORECASE)
+
 
 def without_code(text: str) -> str:
     return re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
@@ -66,6 +69,8 @@ def prose(text: str) -> str:
 def faults(text: str) -> list[str]:
     """Idioms in a text, each with what to say instead."""
     text = " ".join(text.split())
+    if not ANY_BANNED.search(text):
+        return []
     return [
         f"{found[0]!r}: say {better}, in {text[max(0, found.start() - 40) : found.end() + 20]!r}"
         for banned, better in BANNED.items()
@@ -73,12 +78,25 @@ def faults(text: str) -> list[str]:
     ]
 
 
-def descriptions(source: str) -> Iterator[str]:
-    """Docstrings, those of constants among them, and blocks of comments."""
+@lru_cache(maxsize=1)
+def strings(source: str) -> tuple[list[str], list[str]]:
+    """Docstrings, those of constants among them, and all other constant texts of a file."""
+    docstrings: dict[int, str] = {}
+    others: dict[int, str] = {}
     for node in ast.walk(ast.parse(source)):
-        alone = node.value if isinstance(node, ast.Expr) else None
-        if isinstance(alone, ast.Constant) and isinstance(alone.value, str):
-            yield inspect.cleandoc(alone.value)
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            docstrings[id(node.value)] = str(node.value.value)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            others[id(node)] = node.value
+    return (
+        [inspect.cleandoc(text) for text in docstrings.values()],
+        [text for key, text in others.items() if key not in docstrings],
+    )
+
+
+def descriptions(source: str) -> Iterator[str]:
+    """Docstrings, and blocks of comments."""
+    yield from strings(source)[0]
     block: list[str] = []
     last = 0
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
@@ -91,14 +109,9 @@ def descriptions(source: str) -> Iterator[str]:
     yield "\n".join(block)
 
 
-def messages(source: str) -> Iterator[str]:
+def messages(source: str) -> list[str]:
     """Texts of three words and more that are no docstrings or pages: mostly for users."""
-    tree = ast.parse(source)
-    others = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    for node in ast.walk(tree):
-        text = node.value if isinstance(node, ast.Constant) and id(node) not in others else None
-        if isinstance(text, str) and "<" not in text and len(text.split()) > 2:
-            yield text
+    return [text for text in strings(source)[1] if "<" not in text and len(text.split()) > 2]
 
 
 def words_of(description: str) -> str:

@@ -44,7 +44,7 @@ def test_points_project_to_the_observations_of_their_keyframes(active, monkeypat
     before = transform(T, active.points.xyz[mine])
     seen = [KNOWN.view.seen(k.points_px + k.rolled_px) for k in active.keyframes]
     see_by(active.segment, KNOWN.view, OTHER)
-    active.see_anew(OTHER)
+    active.use_calibration(OTHER)
     after = transform(T, active.points.xyz[mine])
     camera = OTHER.view.camera
     assert active.camera == camera

@@ -76,5 +76,5 @@ def test_observations_weigh_by_the_uncertainty_of_the_camera():
     )  # fmt: skip
     active.rebuild_window()
     np.testing.assert_array_equal(active.window.w[0], weigh(AXIS_HALF_BORDER, CAMERA, (0.02, 0.0)))
-    active.see_anew(given.with_lens(np.zeros(7), found(0.001, 0.002)))
+    active.use_calibration(given.with_lens(np.zeros(7), found(0.001, 0.002)))
     np.testing.assert_array_equal(active.window.w[0], weigh(AXIS_HALF_BORDER, CAMERA, (0.002, 0.0)))

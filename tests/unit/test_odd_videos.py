@@ -32,8 +32,8 @@ from pliant.datasets.packet_decoder import decodes, parameter_sets
 from pliant.datasets.rectifier import Rectifier, decode
 from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.video import shown_frames
-from pliant.datasets.video_decoder import opened
-from pliant.datasets.video_streams import Patch, PatchedFile, VideoStream, choose, streams_of
+from pliant.datasets.video_decoder import opened, streams_of
+from pliant.datasets.video_streams import Patch, PatchedFile, VideoStream, choose
 from pliant.errors import DatasetError
 
 FRAMES = 10

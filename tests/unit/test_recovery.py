@@ -14,10 +14,10 @@ from pliant.algorithms.geometry import inverse, so3_exp
 from pliant.algorithms.inertial.gyro import GyroTurn
 from pliant.algorithms.map_delta import LOST, TRACKING
 from pliant.algorithms.slam.frame import Frame
-from pliant.algorithms.slam.locate.landmark_search import search_radius_px
+from pliant.algorithms.slam.locate.landmark_search import MAX_RADIUS_SHARE, search_radius_px
 from pliant.algorithms.slam.locate.localisation import Motion
 from pliant.algorithms.slam.mapper import Mapper
-from pliant.algorithms.slam.parameters import MappingParameters, RecoveryParameters
+from pliant.algorithms.slam.parameters import MappingParameters
 from pliant.algorithms.tracks import FrameExtrema
 
 
@@ -143,10 +143,9 @@ def test_time_not_frames_decides_how_far_the_camera_has_gone():
 
 
 def test_the_search_grows_with_the_time_without_a_pose_and_has_an_end():
-    parameters = RecoveryParameters()
-    radii = [search_radius_px(s, CAMERA, parameters) for s in (0.03, 0.3, 100.0)]
+    radii = [search_radius_px(s, CAMERA) for s in (0.03, 0.3, 100.0)]
     assert 0.0 < radii[0] < radii[1] < radii[2]
-    assert radii[2] == parameters.max_radius_share * CAMERA.width
+    assert radii[2] == MAX_RADIUS_SHARE * CAMERA.width
 
 
 def test_predictions_and_their_prior_have_the_rotation_of_the_gyro():

@@ -162,7 +162,7 @@ def test_a_run_is_read_with_the_keys_alone(endpoint: str) -> None:
     points = PointBlocks()
     xyz, rgb = np.array([(1, 2, 3), (4, 5, 6)], np.float32), np.array([(9, 8, 7), (1, 2, 3)])
     ids = np.arange(2)
-    points.tell(ids, xyz, rgb.astype(np.uint8), ids * 0, ids[:0], snapshot=True)
+    points.update(ids, xyz, rgb.astype(np.uint8), ids * 0, ids[:0], snapshot=True)
     with open_session([endpoint]) as ours, open_session([endpoint]) as theirs:
         reader = Reader(theirs)
         canvas = RosCanvas(Node(ours, "/pliant"), "/pliant")

@@ -11,7 +11,7 @@ from pliant.algorithms.map_delta import TRACKING
 from pliant.algorithms.slam.frame import Frame
 from pliant.algorithms.slam.locate.pose_quality import support_of, why_doubtful
 from pliant.algorithms.slam.mapper import Mapper
-from pliant.algorithms.slam.parameters import MappingParameters, SupportParameters
+from pliant.algorithms.slam.parameters import MappingParameters
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.map_history import FramePose, MapHistory
 from pliant.messages.types import PASSED_OVER
@@ -28,9 +28,7 @@ from pliant.results.judgement import (
 
 def doubt_of(points, inliers, settled):
     """settled: where tracks are that had time to become points."""
-    return why_doubtful(
-        support_of(points, inliers, len(points), settled, CAMERA), SupportParameters()
-    )
+    return why_doubtful(support_of(points, inliers, len(points), settled, CAMERA))
 
 
 def places(count, left=0.0, right=1.0, seed=0):

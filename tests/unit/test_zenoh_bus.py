@@ -61,12 +61,12 @@ def test_a_sender_is_never_more_than_a_window_ahead_of_its_slowest_reader(endpoi
 def test_a_reader_of_images_reports_at_once_when_it_has_taken_all(endpoint: str) -> None:
     """Long before a quarter of the window: in live mode its sender waits for that."""
     with writer(endpoint) as sender, reader(endpoint) as bus:
-        bus._tell_every = 100
+        bus._report_every = 100
         taken = bus.receive(topics.IMAGE)
         for frame in range(3):
             sender.publish(topics.IMAGE, image(frame))
             assert next(taken).frame == frame
-            assert bus._inputs[topics.IMAGE.key].told == frame + 1
+            assert bus._inputs[topics.IMAGE.key].reported == frame + 1
             sender.wait_until_taken(topics.IMAGE)
             assert sender.untaken(topics.IMAGE, "tracking") == 0
         sender.end_all()

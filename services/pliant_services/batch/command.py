@@ -87,7 +87,7 @@ class _Batch:
             if outcome.exit_code is not None:
                 clip.exit_code = outcome.exit_code
                 clip.state = "done" if outcome.exit_code in (DONE, INCOMPLETE) else "failed"
-                for key, value in outcome.told.items():
+                for key, value in outcome.entry.items():
                     setattr(clip, key, value)
                 _say(f"{name}: {clip.verdict}: {clip.reason} ({clip.seconds:.0f} s)")
             self.save()
@@ -129,7 +129,7 @@ def run_batch(
         try:
             run(batch.errands(), batch.begin, batch.end)
         finally:
-            _tell(batch)
+            _print_table(batch)
     codes = {clip.exit_code for clip in clips}
     return FAILED if codes - {DONE, INCOMPLETE} else max(DONE, *(c or 0 for c in codes))
 
@@ -158,7 +158,7 @@ def _named(sources: Sequence[Path]) -> list[tuple[Path, str]]:
 
 
 def _read(output: Path, options: list[str]) -> list[Clip] | None:
-    """The rows of a batch that was begun there with the same options; None where none was."""
+    """The rows of a batch that was begun there with the same options; None if none was."""
     path = output / SUMMARY_NAME
     if not path.exists():
         if output.exists() and (not output.is_dir() or any(output.iterdir())):
@@ -171,9 +171,9 @@ def _read(output: Path, options: list[str]) -> list[Clip] | None:
     except (OSError, ValueError, KeyError, TypeError):
         raise ResultError(f"{path}: not a batch summary: choose another --output") from None
     if before != options:
-        said = " ".join(before) or "none"
+        given = " ".join(before) or "none"
         raise ResultError(
-            f"{output}: the batch was started with other options of run ({said}): pass those, or "
+            f"{output}: the batch was started with other options of run ({given}): pass those, or "
             "choose another --output"
         )
     return clips
@@ -204,7 +204,7 @@ def _run_here(
             raise
 
 
-def _tell(batch: _Batch) -> None:
+def _print_table(batch: _Batch) -> None:
     """The table, one row a clip."""
     clips, output = batch.clips, batch.output
     head = ("clip", "verdict", "frames", "posed", "longest", "seconds", "result")

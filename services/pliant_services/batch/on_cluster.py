@@ -65,7 +65,7 @@ class Cluster:
     ) -> None:
         """Run all of them.  begun, over: called with the clip, the worker, and the outcome.
 
-        Ctrl-C cuts off those that run; raises KeyboardInterrupt then.  Raises BusError where the
+        Ctrl-C cuts off those that run; raises KeyboardInterrupt then.  Raises BusError if the
         scheduler goes away.
         """
         topic = f"pliant-batch-{uuid.uuid4().hex}"
@@ -110,7 +110,7 @@ class Cluster:
             why = "Pliant is not installed on a worker: install the same release there"
         elif isinstance(error, self._distributed.scheduler.KilledWorker):
             why = "several workers died while processing it"
-        return Outcome(exit_code=1, told={"verdict": "failed", "reason": why})
+        return Outcome(exit_code=1, entry={"verdict": "failed", "reason": why})
 
 
 def _run(name: str, errand: Errand, topic: str) -> Outcome:

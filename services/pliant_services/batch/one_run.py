@@ -49,7 +49,7 @@ class Outcome:
 
     exit_code: int | None
     seconds: float = 0.0
-    told: dict[str, Any] = field(default_factory=dict[str, Any])
+    entry: dict[str, Any] = field(default_factory=dict[str, Any])
 
 
 def run_clip(errand: Errand, stopped: Callable[[], bool]) -> Outcome:
@@ -74,7 +74,7 @@ def run_clip(errand: Errand, stopped: Callable[[], bool]) -> Outcome:
     report = _report_of(result) if begun else None
     resumes = (result / STATE_FOLDER).is_dir()
     if report is not None and not resumes:
-        return Outcome(exit_code=grade(report), told=_told(report))
+        return Outcome(exit_code=grade(report), entry=_entry_of(report))
     arguments = ["--output", errand.result]
     if "--on-crash" not in errand.options:
         arguments += ["--on-crash", "restart"]  # it can be taken up again
@@ -87,16 +87,16 @@ def run_clip(errand: Errand, stopped: Callable[[], bool]) -> Outcome:
     code = run.wait(stopped)
     seconds = time.monotonic() - began
     if code in (DONE, INCOMPLETE):
-        return Outcome(exit_code=code, seconds=seconds, told=_told(_report_of(result) or {}))
+        return Outcome(exit_code=code, seconds=seconds, entry=_entry_of(_report_of(result) or {}))
     if code is None:
         return Outcome(exit_code=None, seconds=seconds)
     return Outcome(
-        exit_code=code, seconds=seconds, told={"verdict": "failed", "reason": run.last_words()}
+        exit_code=code, seconds=seconds, entry={"verdict": "failed", "reason": run.last_words()}
     )
 
 
 def _failed(why: str) -> Outcome:
-    return Outcome(exit_code=FAILED, told={"verdict": "failed", "reason": why})
+    return Outcome(exit_code=FAILED, entry={"verdict": "failed", "reason": why})
 
 
 def _report_of(result: Path) -> dict[str, Any] | None:
@@ -106,7 +106,7 @@ def _report_of(result: Path) -> dict[str, Any] | None:
         return None
 
 
-def _told(report: dict[str, Any]) -> dict[str, Any]:
+def _entry_of(report: dict[str, Any]) -> dict[str, Any]:
     """The row of the table for a run that has ended."""
     segments = report.get("segments") or []
     frames = report.get("frames", 0)
@@ -125,7 +125,7 @@ class OneRun:
     """Its output goes to its log."""
 
     def __init__(self, arguments: list[str], log: Path, folder: Path) -> None:
-        """arguments: of ``pliant run``.  Raises OSError where the log cannot be written."""
+        """arguments: of ``pliant run``.  Raises OSError if the log cannot be written."""
         command = [sys.executable, "-m", "pliant_services.cli", "run", *arguments]
         with create(log) as file:
             self._process = subprocess.Popen(
@@ -139,7 +139,7 @@ class OneRun:
         self._log = log
 
     def wait(self, stopped: Callable[[], bool]) -> int | None:
-        """Its exit code; None where it was cut off, as it was to stop."""
+        """Its exit code; None if it was cut off, as it was to stop."""
         while True:
             try:
                 return self._process.wait(_LOOK_S)

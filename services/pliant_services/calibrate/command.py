@@ -46,7 +46,7 @@ from pliant.results.folder import CALIBRATION_NAME, RECORDING_NAME, REPORT_NAME,
 from pliant.results.run import Run, read_run, seen_by_keyframes
 from pliant.wording import counted
 from pliant_services.calibrate.board import PrintedBoard
-from pliant_services.cli.counting import tell_progress
+from pliant_services.cli.counting import show_progress
 from pliant_services.run.command import RunRequest, run_pipeline
 
 _LOOKED_AT = 200
@@ -81,7 +81,7 @@ class _Found:
 
 
 def check_file(output: Path, *, source: str, mask: Path | None, force: bool) -> None:
-    """Raise ResultError where the calibration cannot go there.  Changes nothing."""
+    """Raise ResultError if the calibration cannot go there.  Changes nothing."""
     if output.is_dir():
         raise ResultError(f"{output} is a folder: name a file, such as {output / 'calib.yaml'}")
     picture = picture_of(output)
@@ -148,7 +148,7 @@ def calibrate_with_board(
     seen = [SeenCorners(v.points_px, r) for v, r in zip(used, result.residuals, strict=True)]
     covered = coverage(seen, width, height)
     lines = [
-        _said(calibration, result.focal_sigma),
+        _described(calibration, result.focal_sigma),
         f"reprojection error {result.rms_px:.2f} px in {counted(len(used), 'view')}, of "
         f"{counted(len(found), 'frame')} with {printed.spelled}; they cover "
         f"{100.0 * covered:.0f} % of the image",
@@ -174,7 +174,7 @@ def _look_for(
     others: list[U8] = []
     total, looked = -(-count // every), 0
     for frame in frames:
-        tell_progress("looking for the board", min(looked, total - 1), total)
+        show_progress("looking for the board", min(looked, total - 1), total)
         try:
             pixels, clearance = decode(frame), clearance_in(as_it_is.mask(frame))
         except BrokenFrame:
@@ -190,7 +190,7 @@ def _look_for(
             found.append(_Found(view, sharpness(resized(pixels, LONGEST_SIDE_PX))))
         elif looked % max(1, total // _TRIED) == 0:
             others.append(pixels)
-    tell_progress("looking for the board", total, total)
+    show_progress("looking for the board", total, total)
     return found, others, looked
 
 
@@ -289,7 +289,7 @@ def calibrate_without_board(
         recording = Recording(Path(folder) / "run" / RECORDING_NAME)
         run = read_run(recording.path)
         left, count = left_over(recording, run)
-    lines = [_said(calibration, calibration.focal_sigma), verdict]
+    lines = [_described(calibration, calibration.focal_sigma), verdict]
     make_folder(output.parent)
     _write(output, calibration, [f"pliant calibrate {source}", verdict])
     picture = picture_of(output)
@@ -313,13 +313,13 @@ def left_over(recording: Recording, run: Run) -> tuple[SeenCorners, int]:
     Noise is gone from medians: what is left is a lens that is none of the found one's.
     """
     ideal = IdealCamera(run)
-    told = seen_by_keyframes(recording, set(ideal.keyframes.values()))
+    seen_at = seen_by_keyframes(recording, set(ideal.keyframes.values()))
     places, offs = [np.zeros((0, 2))], [np.zeros((0, 2))]
     for frame, number in ideal.keyframes.items():
-        if number not in told:
+        if number not in seen_at:
             continue
-        rows, points = run.history.points_of(told[number].point_ids)
-        points_px, T = told[number].points_px[rows], ideal.poses[frame]
+        rows, points = run.history.points_of(seen_at[number].point_ids)
+        points_px, T = seen_at[number].points_px[rows], ideal.poses[frame]
         local = (points.positions - T[:3, 3]) @ T[:3, :3]
         off = ideal.pixels(frame, points_px) - ideal.camera.project(local)
         good = (local[:, 2] > 0.0) & (np.linalg.norm(off, axis=1) < INLIER_PX)
@@ -337,7 +337,7 @@ def left_over(recording: Recording, run: Run) -> tuple[SeenCorners, int]:
     return SeenCorners(found[:, 0], found[:, 1]), len(at)
 
 
-def _said(calibration: Calibration, focal_sigma: float) -> str:
+def _described(calibration: Calibration, focal_sigma: float) -> str:
     fov = math.degrees(2.0 * math.atan(0.5 * calibration.width / calibration.fx))
     sure = f" +- {focal_sigma * calibration.fx:.2g} px" if focal_sigma > 0.0 else " px"
     return (

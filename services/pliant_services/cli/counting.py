@@ -3,7 +3,7 @@
 import sys
 
 
-def tell_progress(what: str, done: int, total: int) -> None:
+def show_progress(what: str, done: int, total: int) -> None:
     """One line of a terminal that counts; total below 1: it is unknown."""
     if sys.stderr.isatty():
         end = "\n" if done == total else ""

@@ -80,12 +80,12 @@ def export(
     from functools import partial
 
     from pliant.export.export import export_result
-    from pliant_services.cli.counting import tell_progress
+    from pliant_services.cli.counting import show_progress
 
     written = export_result(
         result, to, output, force=force, every=every, triangles=triangles, clean=clean,
         observed=observed, crop=None if crop is None else _box(crop),
-        progress=partial(tell_progress, f"{to}: image"),
+        progress=partial(show_progress, f"{to}: image"),
     )  # fmt: skip
     typer.echo(str(written))
 

@@ -49,7 +49,7 @@ def session_at(
 ) -> tuple[list[str], str]:
     """Endpoints and name of a session: of the run that writes a result, or as they are given.
 
-    Raises ResultError where no run does, and without either.
+    Raises ResultError if no run does, and without either.
     """
     from pliant.errors import ResultError
     from pliant_services.runtime.announced import running_session

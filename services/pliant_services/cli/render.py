@@ -24,12 +24,12 @@ def render(
     from pliant.datasets.builtin import builtin_folder
     from pliant.errors import ResultError
     from pliant.results.folder import keep_apart
-    from pliant_services.cli.counting import tell_progress
+    from pliant_services.cli.counting import show_progress
 
     if output is not None and output.exists() and not force:
         raise ResultError(f"{output} exists: choose another --output, or --force to replace it")
 
-    folder = builtin_folder(name, progress=tell_progress)
+    folder = builtin_folder(name, progress=show_progress)
     if output is not None:
         keep_apart(output, [folder])
         shutil.copytree(folder, output, dirs_exist_ok=force)

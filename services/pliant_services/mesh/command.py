@@ -66,7 +66,7 @@ class Meshing:
 def mesh_recording(recording: Path, config: Config) -> Meshing:
     """Run the meshing service on a recording.
 
-    Raises RecordingError where it has no keyframes; VoxelSizeError before the work starts.
+    Raises RecordingError if it has no keyframes; VoxelSizeError before the work starts.
     """
     reader = MetricRecording(recording)
     inputs = {topic: reader.decoded(topic) for topic in _MESHING.inputs}
@@ -148,7 +148,7 @@ def _changed(
 
 
 def write_watertight(output: Path, found: Meshing, segment: int) -> Iterator[str]:
-    """The fine mesh of a segment, closed.  Raises ResultError where it does not close."""
+    """The fine mesh of a segment, closed.  Raises ResultError if it does not close."""
     mesh = mesh_of(found.pieces, segment)
     if mesh is not None and len(mesh.triangles):
         closed = watertight(mesh)

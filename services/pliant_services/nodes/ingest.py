@@ -66,7 +66,7 @@ def run(
     """Publish until the source ends or ``stopping()``.
 
     known: a map of earlier sessions.   measured: what other sensors of the source measured.
-    Raises SourceLostError where the source fails after its first frame; what came before is sent.
+    Raises SourceLostError if the source fails after its first frame; what came before is sent.
     """
     live, heard = plays_live(dataset, config), heard_by(dataset)
     rectifier = Rectifier(dataset.calibration)

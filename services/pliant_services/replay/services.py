@@ -22,7 +22,7 @@ from pliant.errors import RecordingError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic, by_key
 from pliant.messages.types import CameraStream, Header, Image, StreamEnd
-from pliant.recording.reader import Recorded, Recording
+from pliant.recording.reader import Recording
 from pliant.recording.summary import Summary
 from pliant.recording.writer import RecordingWriter
 from pliant_services.processes import PROCESSES, Process, outputs_of
@@ -50,7 +50,7 @@ def recorded_services(summary: Summary) -> list[str]:
 
 
 def require_inputs(summary: Summary, services: Sequence[Process]) -> None:
-    """Raise RecordingError where the recording lacks what services read of every frame."""
+    """Raise RecordingError if the recording lacks what services read of every frame."""
     needing = _lacking(summary, services, topics.IMAGE)
     if needing:
         raise RecordingError(
@@ -183,7 +183,7 @@ def copied(
             assert isinstance(end, StreamEnd)
             key = end.topic
         if key not in stale:
-            _write(writer, message)
+            message.write_to(writer)
 
 
 def run_on(
@@ -264,13 +264,3 @@ def affected(services: Sequence[Process]) -> set[str]:
             stale |= set(process.outputs)
             affected |= {topic.key for topic in outputs_of(process.name)}
     return affected
-
-
-def _write(writer: RecordingWriter, message: Recorded) -> None:
-    writer.write(
-        message.topic,
-        message.data,
-        sequence=message.sequence,
-        log_time_ns=message.log_time_ns,
-        publish_time_ns=message.publish_time_ns,
-    )

@@ -119,7 +119,7 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None, held: He
     if is_builtin(spec.location):
         from pliant.datasets.builtin import builtin_folder  # other sources need none
 
-        builtin_folder(spec.location, progress=_say_rendering)
+        builtin_folder(spec.location, progress=_report_rendering)
     dataset = open_source(spec, config.ingest.model_copy(update={"mask_static": False}))
     check_start(dataset)
     if request.quality == "high" and plays_live(dataset, config):
@@ -133,7 +133,7 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None, held: He
     for note in (*notes_on(dataset), *measurements_of(request.source, dataset).notes):
         progress.say(note)
     if spec.calibration is None and spec.fov_deg is None:
-        _say_guess(dataset.calibration, profile, progress)
+        _report_guess(dataset.calibration, profile, progress)
     if profile == _DEFORMABLE:
         profile = deformable_fleet(config)
     else:
@@ -233,7 +233,7 @@ def _go_through(
             with announced(output, fleet.endpoint, fleet.session), progress:
                 if viewer is not None:
                     viewer.start(fleet)
-                with _told_poses(request, fleet):
+                with _printed_poses(request, fleet):
                     fleet.start(lambda name: service_arguments(name, request, output))
                     look_on = f"; watch live: pliant view {output}" if has_viewer() else ""
                     interrupted = _wait(fleet, progress, f"services are up{look_on}")
@@ -248,13 +248,13 @@ def _go_through(
         fleet.close()
 
 
-def _told_poses(request: RunRequest, fleet: Fleet) -> AbstractContextManager[None]:
+def _printed_poses(request: RunRequest, fleet: Fleet) -> AbstractContextManager[None]:
     if not request.poses:
         return nullcontext()
-    from pliant_services.run.poses import told_poses  # loads modules that other runs do not need
+    from pliant_services.run.poses import printed_poses  # loads modules that other runs do not need
 
     known = None if request.known is None else MapFile(request.known)
-    return told_poses(fleet, known, deformable=request.profile == _DEFORMABLE)
+    return printed_poses(fleet, known, deformable=request.profile == _DEFORMABLE)
 
 
 def _wait(fleet: Fleet, progress: Progress, up: str) -> bool:
@@ -327,7 +327,7 @@ def _finish(
     return INTERRUPTED if interrupted else grade(report)
 
 
-def _say_guess(calibration: Calibration, profile: str, progress: Progress) -> None:
+def _report_guess(calibration: Calibration, profile: str, progress: Progress) -> None:
     """Report the initial calibration of an unknown camera.  Raises CalibrationError."""
     if calibration.focal_sigma == 0.0:
         return
@@ -343,6 +343,6 @@ def _say_guess(calibration: Calibration, profile: str, progress: Progress) -> No
     )
 
 
-def _say_rendering(what: str, done: int, total: int) -> None:
+def _report_rendering(what: str, done: int, total: int) -> None:
     if done == 0:
         print(f"built-in sequence, {what} (once) ...", file=sys.stderr)

@@ -28,7 +28,7 @@ _LAST_S = 5.0
 
 
 @contextmanager
-def told_poses(fleet: Fleet, known: MapFile | None, *, deformable: bool) -> Generator[None]:
+def printed_poses(fleet: Fleet, known: MapFile | None, *, deformable: bool) -> Generator[None]:
     """Print them until the run is over.  known: the loaded map."""
     topic = topics.SURFELS if deformable else topics.MAP_UPDATE
     heard: SimpleQueue[Received | None] = SimpleQueue()

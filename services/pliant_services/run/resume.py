@@ -33,8 +33,8 @@ def resumed_config(output: Path, request: RunRequest) -> Config:
         kept = load_config(output / CONFIG_NAME)
     except ConfigError as error:
         raise ResultError(f"{error}; resume with the release that began, or start again") from None
-    said = request.overrides or request.config_file or request.seed is not None
-    if said and kept != load_config(request.config_file, request.overrides, seed=request.seed):
+    is_given = request.overrides or request.config_file or request.seed is not None
+    if is_given and kept != load_config(request.config_file, request.overrides, seed=request.seed):
         raise ResultError(
             "--resume uses the configuration of its run, and this one differs: leave out "
             "--config, --set, --seed and other options that change it"
@@ -68,7 +68,7 @@ def has_ended(output: Path, services: Sequence[str], config: Config) -> bool:
 
 
 def check_ended(output: Path, config: Config) -> None:
-    """Raise ResultError where a run without checkpoints was not recorded to its end."""
+    """Raise ResultError if a run without checkpoints was not recorded to its end."""
     from pliant.results.surfels import has_surfels  # loads modules that a launcher does not need
 
     deformable = has_surfels(output / RECORDING_NAME)

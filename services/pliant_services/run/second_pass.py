@@ -68,7 +68,7 @@ def second_pass(output: Path, request: RunRequest, code: int) -> int:
         if why:
             _say(why)
             return code
-        _say(_told(stretches))
+        _say(_described(stretches))
         with staging(output) as folder:
             made = folder / "result"
             made.mkdir()
@@ -183,15 +183,15 @@ def _keyframes(rest: Keyframe, reached: Reached) -> Keyframe:
     made = dict(sorted(reached.keyframes.items()))
     pictured = {number: each for number, each in made.items() if each.jpeg}
     names = [field.name for field in fields(KeyframeDelta)]
-    told = {name: getattr(rest, name) for name in names}
+    arrays = {name: getattr(rest, name) for name in names}
     counts = np.array([len(each.point_ids) for each in made.values()], np.int32)
-    told["keyframe_ids"] = np.concatenate([rest.keyframe_ids, np.array(list(made), np.int64)])
-    told["settled"] = np.concatenate([rest.settled, np.ones(len(made), np.bool_)])
-    told["counts"] = np.concatenate([rest.counts, counts])
-    told["point_ids"] = np.concatenate([rest.point_ids, *(e.point_ids for e in made.values())])
-    told["points_px"] = np.concatenate([rest.points_px, *(e.points_px for e in made.values())])
+    arrays["keyframe_ids"] = np.concatenate([rest.keyframe_ids, np.array(list(made), np.int64)])
+    arrays["settled"] = np.concatenate([rest.settled, np.ones(len(made), np.bool_)])
+    arrays["counts"] = np.concatenate([rest.counts, counts])
+    arrays["point_ids"] = np.concatenate([rest.point_ids, *(e.point_ids for e in made.values())])
+    arrays["points_px"] = np.concatenate([rest.points_px, *(e.points_px for e in made.values())])
     return replace(
-        rest, **told,
+        rest, **arrays,
         earlier_ids=(*rest.earlier_ids, *pictured),
         earlier_jpegs=(*rest.earlier_jpegs, *(each.jpeg for each in pictured.values())),
         earlier_masks=_masks(rest, [each.mask for each in pictured.values()]),
@@ -234,7 +234,7 @@ def _write(writer: RecordingWriter, topic: Topic, messages: list[Header]) -> Non
         )  # fmt: skip
 
 
-def _told(stretches: list[Stretch]) -> str:
+def _described(stretches: list[Stretch]) -> str:
     frames = sum(each.last - each.first + 1 for each in stretches)
     return f"reading {counted(frames, 'frame')} backwards, where the camera was lost"
 

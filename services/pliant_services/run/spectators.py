@@ -20,7 +20,7 @@ def has_viewer() -> bool:
 
 
 def check_viewer(output: Path, *, web: bool, save: Path | None, force: bool) -> None:
-    """Raise ResultError where a run's viewer could not start: before an earlier result is touched.
+    """Raise ResultError if a run's viewer could not start: before an earlier result is touched.
 
     output: the result folder, which need not be there yet.
     """

@@ -86,7 +86,7 @@ class Child:
 
 
 def first_to_fail(children: Sequence[Child]) -> Child | None:
-    """Which of the services has failed by itself; None where none has failed.
+    """Which of the services has failed by itself; None if none has failed.
 
     One death makes others complain that it went away.  It left the session before they heard of
     it, but its process may end after theirs: then that is waited for.

@@ -19,12 +19,12 @@ def deliver_swallowed_interruptions() -> None:
     if threading.current_thread() is not threading.main_thread():
         return
     lost: list[signal.Signals] = []
-    tell = sys.unraisablehook
+    usual_hook = sys.unraisablehook
 
     def on_unraisable(unraisable: Any) -> None:
         kind = _RAISED_BY.get(unraisable.exc_type)
         if kind is None:
-            tell(unraisable)
+            usual_hook(unraisable)
             return
         lost.append(kind)
         signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)

@@ -1,8 +1,8 @@
 """Supervises one run: starts the services in order, watches them, stops them cleanly.
 
 The launcher hosts the router, so that a run needs no other program; every service is a process of
-its own.  When the source ends, or on Ctrl-C, the end of the stream passes through the services and
-each leaves by itself once it has read everything, so that nothing on the way is lost.
+its own.  When the source ends, or on Ctrl-C, the end of the stream passes through the services.
+Each exits once it has read everything, so no message is lost.
 """
 
 import os
@@ -247,7 +247,7 @@ class Fleet:
         self._children[index] = self._spawn(child.name)
 
     def raise_if_died(self) -> None:
-        """Raise ServiceDiedError where a service has failed."""
+        """Raise ServiceDiedError if a service has failed."""
         first = first_to_fail(self._children)
         if first is not None:
             raise ServiceDiedError(first.obituary(), crashed=first.crashed)

@@ -12,7 +12,7 @@ _ADDRESSES = 4 << 30
 
 
 def check_limits() -> None:
-    """Take as many open files as the system grants.  Raises PliantError where limits are too low
+    """Take as many open files as the system grants.  Raises PliantError if limits are too low
     for a service."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     unlimited = resource.RLIM_INFINITY

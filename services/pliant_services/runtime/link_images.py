@@ -73,7 +73,7 @@ def receive_images(bus: Bus, *, mapped_only: bool = False) -> Iterator[Image]:
 
 
 def whole(image: Image) -> Image:
-    """The image that a JPEG gives.  Raises MessageError where it gives none."""
+    """The image that a JPEG gives.  Raises MessageError if it gives none."""
     where = f"{topics.IMAGE.key}: frame {image.frame}"
     try:
         calibration, rectifier = _rectifier(image.calibration)

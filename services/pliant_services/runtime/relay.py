@@ -53,11 +53,11 @@ class Relay:
         self._thread.start()
 
     def wait_for_viewer(self, timeout_s: float) -> bool:
-        """Wait until the first viewer has come; False where none does in time."""
+        """Wait until the first viewer has come; False if none does in time."""
         return self._seen.wait(timeout_s)
 
     def wait_for_last_viewer(self, timeout_s: float) -> bool:
-        """Wait until the last viewer has left; False where one is still there by then."""
+        """Wait until the last viewer has left; False if one is still there by then."""
         return self._alone.wait(timeout_s)
 
     def know_camera(self, camera: tuple[bytes, bytes]) -> None:
@@ -101,7 +101,7 @@ class Relay:
         """Forward until the last viewer is gone; of a session that is over, its last messages."""
         outputs = {topic: self._publisher(topic) for topic in (*topics.VIEWED, topics.STREAM)}
         inputs = {topic: self._ring(topic.key, topic.viewed) for topic in topics.VIEWED}
-        told = self._ring(topics.status("*").key, _STATUS_RING)
+        statuses = self._ring(topics.status("*").key, _STATUS_RING)
         greeted: set[str] = set()
         idle, last_word = False, time.monotonic() + _LAST_WORDS_S
         while self._viewers:
@@ -119,7 +119,7 @@ class Relay:
                 if sample is not None:
                     idle = False
                     outputs[topic].put(sample.payload, attachment=sample.attachment)
-            sample = told.try_recv()
+            sample = statuses.try_recv()
             if sample is not None:
                 idle = False
                 key = str(sample.key_expr).removeprefix(f"{self._prefix}/")
@@ -131,7 +131,7 @@ class Relay:
                 )
             if idle:
                 self._stopping.wait(_PAUSE_S)
-        for declared in (*inputs.values(), told, *outputs.values()):
+        for declared in (*inputs.values(), statuses, *outputs.values()):
             declared.undeclare()
 
     def _ring(self, key: str, size: int) -> Any:
@@ -235,7 +235,7 @@ class Relays:
 
 
 def _camera_in(sample: zenoh.Sample) -> tuple[bytes, bytes] | None:
-    """A camera as a session tells it, with its envelope; None for anything else."""
+    """A camera as a session publishes it, with its envelope; None for anything else."""
     envelope = sample.attachment.to_bytes() if sample.attachment is not None else b""
     if envelope[-1:] != b"\x00" or len(sample.payload) > topics.STREAM.max_bytes:
         return None

@@ -60,7 +60,7 @@ def run_alone(name: str, config: Config, options: ServiceOptions, *, results: bo
     else:
         print(f"{name}: already finished in this session", file=sys.stderr)
     if recorded is not None:
-        _say_over(options)
+        _announce_end(options)
     return code
 
 
@@ -71,7 +71,7 @@ def _held(output: Path | None, *, results: bool) -> AbstractContextManager[objec
     return written(output.parent, force=True) if results else recorded_into(output.parent)
 
 
-def _say_over(options: ServiceOptions) -> None:
+def _announce_end(options: ServiceOptions) -> None:
     """Tell everybody that the session is over.
 
     Again and again until the router has left, as it may listen already but not yet take anything
@@ -120,7 +120,7 @@ def _leave(state: Path | None, name: str) -> None:
 
 
 def _check_recording(output: Path, state: Path | None) -> None:
-    """Raise ResultError where the results cannot go there, or another session's are there."""
+    """Raise ResultError if the results cannot go there, or another session's are there."""
     if output.name != RECORDING_NAME:
         raise ResultError(f"{output}: --results needs a recording named {RECORDING_NAME}")
     own = state / "recorder" if state is not None else None

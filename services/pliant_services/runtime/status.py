@@ -132,7 +132,7 @@ def stop_session(
 ) -> list[str]:
     """Request the end of a session, and wait until its services are gone.
 
-    Returns those that are left.  Raises BusError where there is no such session.
+    Returns those that are left.  Raises BusError if there is no such session.
     """
     here: dict[str, str] = {}
     changed = threading.Condition()

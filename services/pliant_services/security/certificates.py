@@ -38,7 +38,7 @@ def make_certificates(
     key, beside the other unless it is given: its holder can pose as any service, so it
     is not where services look.  session: the only one in which they are good.  Keys are readable by
     their owner alone.  Raises PliantError without
-    the package ``cryptography``, ResultError where a folder cannot be written or does not fit.
+    the package ``cryptography``, ResultError if a folder cannot be written or does not fit.
     """
     authority = authority or authority_of(folder)
     _check(folder, authority)

@@ -146,7 +146,7 @@ def follow(
 
     patience_s: for a session that is about to start.     identity: for tls/ endpoints.
 
-    Raises BusError where nothing listens or what runs is of another version, ResultError where the
+    Raises BusError if nothing listens or what runs is of another version, ResultError if the
     session does not run.
     """
     prefix = f"pliant/{session_name(session)}/view/"
@@ -206,7 +206,7 @@ class Backlog:
                 self._bytes -= len(self._items.popleft().data)
 
     def take(self) -> Arrived | None:
-        """The oldest, None where there is nothing."""
+        """The oldest, None if there is nothing."""
         with self._lock:
             if not self._items:
                 return None
@@ -221,13 +221,13 @@ def _draw_while(canvas: Canvas, waiting: Backlog, goes_on: Callable[[], bool]) -
     goes_on: whether a service still runs, and a viewer is open.
     """
     scene = Scene(canvas)
-    asked, is_over = time.monotonic(), False
+    looked_at, is_over = time.monotonic(), False
     while True:
-        if not is_over and time.monotonic() - asked > _ASK_S:
-            is_over, asked = not goes_on(), time.monotonic()
+        if not is_over and time.monotonic() - looked_at > _ASK_S:
+            is_over, looked_at = not goes_on(), time.monotonic()
         arrived = waiting.take()
         if arrived is None:
-            if is_over and time.monotonic() - asked > _GONE_S:
+            if is_over and time.monotonic() - looked_at > _GONE_S:
                 break
             time.sleep(0.005)
             continue
@@ -259,7 +259,7 @@ def _runs(connection: zenoh.Session, session: str) -> bool:
 
 
 def check_versions(tokens: Iterable[str]) -> None:
-    """Raise BusError where a service is of another version: its messages would not be read."""
+    """Raise BusError if a service is of another version: its messages would not be read."""
     for words in filter(None, (misfit(token, "this viewer") for token in tokens)):
         raise BusError(f"{words}: use the same release for the viewer")
 
@@ -275,7 +275,7 @@ def _recording(source: Path | None) -> Recording | None:
 
 
 def place(*, web: bool, save: Path | None, force: bool) -> Where:
-    """Where a view goes.  Raises ResultError where it cannot."""
+    """Where a view goes.  Raises ResultError if it cannot."""
     if web and save is not None:
         raise ResultError("--web and --save exclude each other: pass only one")
     if save is not None:
@@ -289,7 +289,7 @@ def place(*, web: bool, save: Path | None, force: bool) -> Where:
 
 
 def check_display(instead: str) -> None:
-    """Raise ResultError where no window can be seen."""
+    """Raise ResultError if no window can be seen."""
     has_one = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if sys.platform == "linux" and not has_one:
         raise ResultError(f"there is no display here: use {instead}")

@@ -30,7 +30,7 @@ def show(result: Result) -> None:
 def opened(result: Result) -> Any:
     """The window, with everything in it.
 
-    Raises Open3dError where Open3D cannot be loaded, ResultError where there is no map, or no
+    Raises Open3dError if Open3D cannot be loaded, ResultError if there is no map, or no
     window can be opened.
     """
     if result.is_deformable or not len(result.trajectory):

@@ -1,6 +1,6 @@
 """Records of arrays whose dtype and shape are part of their type, and are checked.
 
-``points_px: Annotated[F32, Shape("N", 2)]`` says float32 of shape (N, 2).  Within one record the
+``points_px: Annotated[F32, Shape("N", 2)]`` means float32 of shape (N, 2).  Within one record the
 same letter is the same size.  Algorithms exchange such records; messages are such records with a
 header, so that what is computed is what is sent.
 """

@@ -103,7 +103,7 @@ class BoardFinder:
             self._detectors = [cv2.aruco.CharucoDetector(each) for each in boards]
 
     def find(self, grey: U8) -> BoardView | None:
-        """The board in an image (H, W); None where it is not, or too little of it."""
+        """The board in an image (H, W); None if it is not, or too little of it."""
         return self._charuco(grey) if self._detectors else self._chessboard(grey)
 
     def _chessboard(self, grey: U8) -> BoardView | None:
@@ -222,7 +222,7 @@ def _change(one: F64, other: F64) -> float:
 def calibrate(
     views: Sequence[BoardView], width: int, height: int, model: BoardLens
 ) -> BoardCalibration | None:
-    """The lens that fits the views best; None where there are too few that agree, or none fits."""
+    """The lens that fits the views best; None if there are too few that agree, or none fits."""
     used: BoolArray = np.ones(len(views), bool)
     while True:
         if used.sum() < MIN_VIEWS:
@@ -285,7 +285,7 @@ def _solved(
             cy=float(matrix[1, 2]),
             coefficients=tuple(np.ravel(k).tolist()),
         )
-        rectified_camera(lens)  # raises ValueError where it folds within the image
+        rectified_camera(lens)  # raises ValueError if it folds within the image
     except (cv2.error, ValueError):
         return None, False
     residuals: list[F64] = []

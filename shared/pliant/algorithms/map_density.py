@@ -29,10 +29,10 @@ def count_distinct(
 ) -> int:
     """How many points remain when duplicates are merged.
 
-    Two points are duplicates when, seen from the frame of either of them, they lie within
-    ``DUPLICATE_PX`` of each other and their depths differ by at most
-    ``DUPLICATE_DEPTH`` of the smaller.  Duplicates of duplicates merge as well, so the count
-    errs on the low side.  Points that are not in the image of their own frame stay as they are.
+    Two points are duplicates if two conditions hold in the frame of either of them.  They lie
+    within ``DUPLICATE_PX`` of each other and their depths differ by at most ``DUPLICATE_DEPTH`` of
+    the smaller.  Duplicates of duplicates merge as well, so the count errs on the low side.  Points
+    that are not in the image of their own frame stay as they are.
 
     points_world: (P, 3), of one map segment.      frames: (P,) a frame that observes each point,
         as for ``evaluate_map``.      T_world_camera: estimated pose of each of those frames; the

@@ -132,11 +132,11 @@ def rectified_camera(lens: Lens) -> PinholeCamera:
 
     It has the size of the source image and square pixels, and its centre looks where the centre
     of the source looks.  Its focal length is the smallest (the widest view) for which every
-    rectified pixel lies inside the source image and inside the fold of the lens model, but not
-    below 0.8 of the lens's own: a wide fisheye loses the rim of its view, so that the centre
-    keeps its resolution.  No pixel of the result is made up.
+    rectified pixel lies inside the source image and inside the fold of the lens model.  It is at
+    least 0.8 of the lens's own: a wide fisheye loses the rim of its view, so that the centre keeps
+    its resolution.  No pixel of the result is made up.
 
-    Raises ValueError where the coefficients leave no usable image.
+    Raises ValueError if the coefficients leave no usable image.
     """
     if not lens.distorts:
         return lens.pinhole

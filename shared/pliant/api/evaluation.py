@@ -1,4 +1,4 @@
-"""A result against ground truth, as ``pliant eval`` compares them."""
+"""Compares a result with ground truth, like ``pliant eval``."""
 
 from pathlib import Path
 
@@ -26,12 +26,12 @@ def evaluate(
 
         evaluation = pliant.evaluate("results/clip", "sequence/groundtruth.txt")
         evaluation.final.ate_m.rmse, evaluation.final.success_rate, evaluation.online
-        evaluation.better  # an offset of the times with which ground truth fits far better, or None
+        evaluation.better  # a time offset that fits ground truth far better, or None
 
-    result: of a run, its folder, a trajectory file or a ``Trajectory``.    groundtruth: a file that
-    ``read_trajectory`` reads, its folder, ``built-in:NAME`` or a ``Trajectory``.    times: of
-    KITTI's poses.    frames: of the sequence, if no report.json has them.    offset: is added to
-    the times of the poses: seconds, or frames as in "3f".
+    result: a ``Result``, its folder, a trajectory file or a ``Trajectory``.    groundtruth: a file
+    for ``read_trajectory``, its folder, ``built-in:NAME`` or a ``Trajectory``.    times: file with
+    the times of KITTI's poses.    frames: number of frames of the sequence, if there is no
+    report.json.    offset: added to the times of the poses, in seconds, or in frames ("3f").
 
     Raises ResultError.
     """
@@ -62,16 +62,16 @@ def evaluate(
 
 
 def read_trajectory(path: str | Path, *, times: str | Path | None = None) -> Trajectory:
-    """Poses of a file: TUM, EuRoC or KITTI, told apart by its first line::
+    """Read a TUM, EuRoC or KITTI trajectory; the first line determines the format::
 
         truth = pliant.read_trajectory("sequence/groundtruth.txt")
         truth.stamps_ns, truth.positions, truth.T_world_camera
 
-    path: the file, the folder of a sequence that has one, or ``built-in:NAME``.    times: of
-    KITTI's poses.  Raises ResultError.
+    path: the file, the folder of a sequence that has one, or ``built-in:NAME``.    times: file with
+    the times of KITTI's poses.  Raises ResultError.
     """
     if is_builtin(str(path)):
-        from pliant.datasets.builtin import builtin_folder  # which renders it where it must
+        from pliant.datasets.builtin import builtin_folder  # which may render it
 
         path = builtin_folder(str(path))
     return trajectory_files.read_trajectory(

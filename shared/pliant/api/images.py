@@ -28,7 +28,7 @@ def source_frame(
     """An image (H, W) grey or (H, W, 3) RGB, uint8, as a frame of a source.
 
     camera: of the image; None if unknown.  mask: (H, W), 0 where it is ignored.  Raises
-    DatasetError where it cannot be its.
+    DatasetError if it cannot be its.
     """
     image = np.asarray(image)
     colour = image.ndim == 3 and image.shape[2] == 3

@@ -58,7 +58,7 @@ class KnownMap:
         camera: Calibration | PinholeCamera | None = None,
         mask: U8 | BoolArray | None = None,
     ) -> Located | None:
-        """Where an image was taken; None where the map is not recognised in it.
+        """Where an image was taken; None if the map is not recognised in it.
 
         image: (H, W) grey or (H, W, 3) RGB, uint8, as the camera took it.    camera: its own, where
         it is not that of the map's last session.    mask: (H, W), 0 where the image is ignored.
@@ -98,7 +98,7 @@ def load_map(path: str | Path) -> KnownMap:
     """The map that a run has left::
 
         office = pliant.load_map("results/office")
-        found = office.localise(image)  # None where it is not recognised
+        found = office.localise(image)  # None if it is not recognised
         found.T_world_camera
 
     path: a result folder or its ``map.pliant``.  Raises MapError.

@@ -9,30 +9,30 @@ from pliant.trajectory import Trajectory
 
 
 class Mapped(ABC):
-    """A trajectory and a cloud of points in one world, whose scale is arbitrary.
+    """A trajectory and a point cloud in one world frame, whose scale is arbitrary.
 
-    Where a map was lost and began anew it has several segments, each a world of its own: what
-    follows is of the longest.
+    A map that was lost and started again has several segments, each with its own world frame.
+    The properties below are those of the longest segment.
     """
 
     @property
     @abstractmethod
     def history(self) -> MapHistory:
-        """All that is known of frames, keyframes and points, of every segment."""
+        """Frames, keyframes and points of all segments."""
 
     @property
     def trajectory(self) -> Trajectory:
-        """Poses after all corrections, one for each frame that has one."""
+        """Final poses T_world_camera, after all corrections, of the frames that have one."""
         return self.history.trajectory_in(self.history.longest_segment(), self.history.placed())
 
     @property
     def online_trajectory(self) -> Trajectory:
-        """Each pose as it was known when its frame was done."""
+        """Online poses T_world_camera: each as it was when its frame had been processed."""
         return self.history.trajectory_in(self.history.longest_segment(), self.history.online)
 
     @property
     def points(self) -> PointArray:
-        """(P, 3) points in the world."""
+        """(P, 3) points in the world frame."""
         points = self._points
         return PointArray.of(points.positions, points.colours)
 

@@ -31,7 +31,7 @@ class PointArray(np.ndarray[tuple[int, ...], np.dtype[np.float64]]):
         return plain[()] if return_scalar else plain
 
     def to_open3d(self) -> Any:
-        """``open3d.geometry.PointCloud``, in colour.  Raises Open3dError where it cannot be loaded.
+        """``open3d.geometry.PointCloud``, in colour.  Raises Open3dError if it cannot be loaded.
 
         Of some of the points it has no colours.
         """
@@ -42,7 +42,7 @@ class Mesh(TriangleMesh):
     """A mesh: ``positions``, ``normals``, ``colours`` of vertices, and ``triangles``."""
 
     def to_open3d(self) -> Any:
-        """``open3d.geometry.TriangleMesh``.  Raises Open3dError where it cannot be loaded."""
+        """``open3d.geometry.TriangleMesh``.  Raises Open3dError if it cannot be loaded."""
         return to_mesh(self)
 
 

@@ -48,8 +48,8 @@ _GREY = 128
 class Keyframe:
     """A keyframe of the longest segment.
 
-    id: of the run.    frame: that it is.    T_world_camera: (4, 4).    point_ids (N,),
-    points_px (N, 2): points of the map and where it sees them, rectified.
+    id: unique in the run.    frame: number of its frame.    T_world_camera: (4, 4).
+    point_ids: (N,) observed points of the map.    points_px: (N, 2) their rectified pixels.
     """
 
     id: int
@@ -61,7 +61,7 @@ class Keyframe:
 
     @property
     def image(self) -> U8:
-        """(H, W, 3) RGB, without distortion; (0, 0, 3) where it was not recorded."""
+        """(H, W, 3) RGB, rectified; (0, 0, 3) if it was not recorded."""
         if not self._jpeg:
             return np.zeros((0, 0, 3), np.uint8)
         data = np.frombuffer(self._jpeg, np.uint8)
@@ -69,17 +69,17 @@ class Keyframe:
 
 
 class Result(Mapped):
-    """A result folder, or a recording alone::
+    """A result folder, or only its recording::
 
         result = pliant.open("results/clip")
         result.trajectory.positions, result.points, result.mesh.positions
         result.keyframes[3].image, result.tracks(120).points_px
 
-    Everything is read at its first use, and kept.
+    Everything is read when it is first used, and kept in memory.
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Raises RecordingError where there is none."""
+        """Raises RecordingError if there is no recording."""
         self.path = Path(path)
         inside = self.path / RECORDING_NAME
         self._recording = Recording(inside if parts.exists(inside) else self.path)
@@ -95,26 +95,26 @@ class Result(Mapped):
 
     @cached_property
     def is_deformable(self) -> bool:
-        """Whether surfels follow a scene that moves."""
+        """Whether the run tracked a deforming scene with surfels."""
         return has_surfels(self._recording.path)
 
     @cached_property
     def report(self) -> dict[str, Any]:
-        """As in report.json: the verdict, frames, times."""
+        """The content of report.json: verdict, frames, times."""
         if self.is_deformable:
             return surfel_report(self._recording.path)
         return rigid_report(self._run, self.history.final())
 
     @property
     def trajectory(self) -> Trajectory:
-        """Poses after all corrections; of surfels, the camera's."""
+        """Final camera poses T_world_camera, after all corrections."""
         if self.is_deformable:
             return surfel_trajectory(self._recording.path)
         return super().trajectory
 
     @cached_property
     def mesh(self) -> Mesh | None:
-        """The fine mesh of the longest segment; None where there is none."""
+        """The fine mesh of the longest segment, in its world frame; None without one."""
         found = mesh_of(self._run.mesh, self.history.longest_segment())
         return None if found is None else Mesh(**vars(found))
 
@@ -153,15 +153,15 @@ class Result(Mapped):
         return sorted(found, key=lambda keyframe: keyframe.frame)
 
     def tracks(self, frame: int) -> Extrema:
-        """The tracks of a frame: ``ids``, ``points_px``, ``ages``."""
+        """The tracks of a frame: ``ids`` (N,), ``points_px`` (N, 2) rectified, ``ages`` (N,)."""
         message = self._message(topics.EXTREMA, frame)
         assert isinstance(message, Extrema)
         return message
 
     def image(self, frame: int) -> U8:
-        """(H, W) or (H, W, 3) RGB of a frame, without distortion.
+        """The rectified image of a frame: (H, W) grey or (H, W, 3) RGB.
 
-        Raises ResultError where images were not recorded, BrokenFrame where it has no pixels.
+        Raises ResultError if images were not recorded, BrokenFrame if the frame has no pixels.
         """
         message = self._message(topics.SOURCE, frame)
         assert isinstance(message, SourceImage)
@@ -173,10 +173,10 @@ class Result(Mapped):
         return recorded_surfels(self._recording.path)
 
     def surface(self, frame: int) -> Surface:
-        """Of a scene that deforms: the mesh between its tracked surfels in a frame, in the world of
-        its segment.  It is grey where no image was recorded.
+        """The surface of a deforming scene in a frame: a mesh of its tracked surfels, in the world
+        frame of its segment.  It is grey if images were not recorded.
 
-        Raises ResultError where the frame was not recorded, or has no surfels.
+        Raises ResultError if the frame was not recorded or has no surfels.
         """
         surfels = self._message(topics.SURFELS, frame)
         assert isinstance(surfels, Surfels)
@@ -195,8 +195,8 @@ class Result(Mapped):
         )
 
     def picture(self, width: int = 960, height: int = 720) -> U8:
-        """(height, width, 3) RGB of the points, the camera's path, and lines between keyframes that
-        show one place."""
+        """Draw the points, the camera path, and lines between keyframes that show the same place:
+        (height, width, 3) RGB."""
         poses = self.trajectory.T_world_camera
         if not len(poses):
             raise ResultError(f"{self.path}: the run has no map to draw")

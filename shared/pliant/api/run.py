@@ -54,29 +54,32 @@ def run(
     on_frame: OnFrame | None = None,
     quiet: bool = False,
 ) -> Result:
-    """Run the whole pipeline on a source, and open what it leaves::
+    """Run the whole pipeline on a source, and open its results::
 
         result = pliant.run("clip.mp4", fov=70)
 
-    Arguments are the options of ``pliant run``: ``pliant run --help`` says more of each.
+    The arguments are the options of ``pliant run``; ``pliant run --help`` describes each in full.
 
-    output: result folder [results/<source>]; force: write into an existing one.    mask: an image
-    whose black parts are ignored in all frames, or a folder of them; auto_mask: mask
-    what never changes.    start, end: seconds after
-    the first frame; every: one of this many frames; sharpest: of those, not the first.    light: a
-    fifth of the tracks.    quality: "high" reads the source again where the camera was lost.
-    imu, gps: a file of inertial samples, of satellite fixes, or their topic.
-    max_size: pixels along the longer side.    map: of an earlier run, to go
-    on in; localise: only to find the frames in it.    camera, depth, depth_frames: of the
-    deformable profile.    settings: ``{"tracking.max_tracks": 5000}`` or
-    ``["tracking.max_tracks=5000"]``.    quiet: print nothing.
+    output: result folder [results/<source>]; force: replace an existing result.
+    calibration: file of the camera; fov: its horizontal field of view, degrees.
+    mask: image whose black parts are ignored in all frames, or a folder with one for each frame.
+    auto_mask: also ignore the parts of the image that never change.
+    start, end: seconds after the first frame.    every: use one of this many frames; sharpest: the
+    sharpest of them instead of the first.    max_size: longer side of the images, px.
+    light: a fifth of the tracks.    quality: "high" reads the source a second time where the camera
+    was lost.    topic: of the images in a bag or recording.
+    imu, gps: file or topic of inertial samples, of satellite fixes.
+    map: result or map file to continue; localise: only localise the frames in it.
+    camera, depth, depth_frames: of the deformable profile.
+    settings: ``{"tracking.max_tracks": 5000}`` or ``["tracking.max_tracks=5000"]``.
+    quiet: print nothing.
 
-    on_frame: called in this thread with each frame's number and its pose (4, 4), as it is known
-    then (``result.online_trajectory``), or None: ``on_frame(12, T_world_camera)``.  The run does
-    not wait for it, but its end does; ``pliant.follow`` gives each frame with its image and tracks.
+    on_frame: called in this thread with the number of each frame and its online pose
+    T_world_camera (4, 4), or None without a pose.  The run does not wait for these calls, but it
+    ends after the last of them.  ``pliant.follow`` also provides the image and tracks of a frame.
 
-    ``result.report["verdict"]`` says whether it went well.  Raises ResultError with what the
-    command says, and what ``on_frame`` raises, when the run has been stopped for it.
+    ``result.report["verdict"]`` rates the result.  Raises ResultError with the command's error
+    message.  An exception in ``on_frame`` stops the run and is raised again.
     """
     folder = Path("results") / folder_name(str(source)) if output is None else Path(output)
     options: dict[str, object] = {
@@ -95,7 +98,7 @@ def run(
     for setting in overrides_of(settings):
         command += ["--set", setting]
     command += ["--", str(source)]  # its name may begin with a dash
-    said = ""
+    last_line = ""
     with subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         text=True, start_new_session=True,  # Ctrl-C is ours to hand on, once
@@ -104,9 +107,9 @@ def run(
         try:
             for line in process.stdout:
                 if on_frame is not None and line.startswith("pose "):
-                    on_frame(*_told(line))
+                    on_frame(*_pose_of(line))
                     continue
-                said = line.strip() or said
+                last_line = line.strip() or last_line
                 if not quiet:
                     print(line, end="", file=sys.stderr)  # a notebook's, too
         except BaseException:
@@ -114,11 +117,11 @@ def run(
             process.communicate()
             raise
     if process.returncode not in (DONE, INCOMPLETE) or not parts.exists(folder / RECORDING_NAME):
-        raise ResultError(said.removeprefix("pliant: "))
+        raise ResultError(last_line.removeprefix("pliant: "))
     return Result(folder)
 
 
-def _told(line: str) -> tuple[int, F64 | None]:
+def _pose_of(line: str) -> tuple[int, F64 | None]:
     """Parse a line of ``--poses``: the number of a frame, and its pose (4, 4) or None."""
     _, frame, _, *pose = line.split()
     return int(frame), pose_to_matrix(np.array(pose, np.float64)) if pose else None

@@ -1,4 +1,4 @@
-"""Mapping image by image in this process: no bus, no files, the same numbers."""
+"""Maps image by image in this process, without bus or files, with the same results."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ _FPS = 30.0
 
 
 class Slam(Mapped):
-    """Localises images in a map that it makes of them::
+    """Maps a sequence of images and localises each of them::
 
         slam = pliant.Slam(fov=70)
         for image, stamp in ...:
@@ -31,7 +31,7 @@ class Slam(Mapped):
         slam.finish()
         slam.trajectory.positions, slam.points
 
-    All is in this process, and nothing is recorded.
+    It runs in this process and records nothing.
     """
 
     def __init__(
@@ -42,11 +42,11 @@ class Slam(Mapped):
         settings: Settings = None,
         seed: int | None = None,
     ) -> None:
-        """camera: of the images; without one it is found from them, beginning with a horizontal
+        """camera: of the images; without one it is estimated from them, starting with a horizontal
         field of view of ``fov`` degrees.    settings: ``{"tracking.max_tracks": 5000}`` or
         ``["tracking.max_tracks=5000"]``.
 
-        Raises ConfigError for a setting that there is not, CalibrationError.
+        Raises ConfigError for an unknown setting, CalibrationError.
         """
         if camera is not None and fov is not None:
             raise CalibrationError("camera and fov exclude each other: pass only one")
@@ -60,20 +60,19 @@ class Slam(Mapped):
 
     @property
     def history(self) -> MapHistory:
-        """The map after all images until now."""
+        """The map after all images so far."""
         return self._history
 
     def track(
         self, image: U8, stamp: float | None = None, mask: U8 | BoolArray | None = None
     ) -> F64 | None:
-        """T_world_camera (4, 4) of the next image; None where it has none, or none yet.
+        """Return T_world_camera (4, 4) of the next image; None if it has no pose, or none yet.
 
-        image: (H, W) grey or (H, W, 3) RGB, of one size.    stamp: when it was taken, in seconds,
-        increasing; without any, 30 images are a second.    mask: (H, W), 0 where the image is
-        ignored.
+        image: (H, W) grey or (H, W, 3) RGB, all of one size.    stamp: capture time in seconds,
+        increasing; without it, 30 images per second.    mask: (H, W), 0 where the image is ignored.
 
-        A map begins once the camera has moved: the images until then get their poses later, see
-        ``trajectory``.  Raises DatasetError for an image or a time that cannot be.
+        The map starts once the camera has moved; earlier images get their poses then, see
+        ``trajectory``.  Raises DatasetError for an invalid image or time.
         """
         return self.take(image, stamp, mask).T_world_camera
 
@@ -132,11 +131,11 @@ class Slam(Mapped):
 class Tracked:
     """A frame with its pose and tracks.
 
-    number: from 0.    stamp_ns: when it was taken.    image: (H, W) or (H, W, 3), rectified; of
-    size 0 where it was broken.    T_world_camera: (4, 4), None without a pose.    segment: of the
-    map.    inliers: points that support the pose.    reason: why there is none, or why it is
-    doubtful; "".    track_ids (N,), points_px (N, 2): the tracks and where the image has them.
-    slam: that took it.
+    number: from 0.    stamp_ns: capture time.    image: (H, W) or (H, W, 3) RGB, rectified; of
+    size 0 if it was broken.    T_world_camera: (4, 4), None without a pose.    segment: of the
+    map.    inliers: points that support the pose.    reason: why there is no pose, or why it is
+    doubtful; "" otherwise.    track_ids: (N,).    points_px: (N, 2) rectified pixels of the tracks.
+    slam: the ``Slam`` that processed the frame.
     """
 
     number: int

@@ -130,7 +130,7 @@ class ObserverBus(Protocol):
         ...
 
     def start_from(self, taken: Mapping[str, int], ended: Collection[str]) -> None:
-        """Go on behind what an earlier start of this service has kept, by topic key."""
+        """Continue after what an earlier start of this service has kept, by topic key."""
         ...
 
     def acknowledge(self) -> None:
@@ -147,7 +147,7 @@ def resume(bus: Bus, start: Callable[[], _S]) -> _S:
 def receive_one(bus: Bus, topic: Topic, message: type[_M]) -> _M:
     """The single message of a topic that carries just one, read to the topic's end.
 
-    Raises BusError where the topic carried none or several.
+    Raises BusError if the topic carried none or several.
     """
     everything = list(receive(bus, topic, message))
     if len(everything) != 1:

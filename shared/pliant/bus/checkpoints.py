@@ -47,7 +47,7 @@ class Checkpoints:
     """The checkpoints of one service in a folder of the session.  Safe to use from two threads."""
 
     def __init__(self, folder: Path, *, interval: int) -> None:
-        """``interval``: frames between two.  Raises BusError where the folder cannot be made."""
+        """``interval``: frames between two.  Raises BusError if the folder cannot be made."""
         self._folder = folder
         self._interval = interval
         self._lock = threading.Lock()
@@ -79,7 +79,7 @@ class Checkpoints:
     def save(self, place: Place, state: bytes, written: Callable[[], None]) -> None:
         """Write in the background, whole or not at all; then call ``written``.
 
-        Raises BusError where the one before could not be written.
+        Raises BusError if the one before could not be written.
         """
         if self._failure is not None:
             raise BusError(f"{self._folder}: cannot write checkpoints: {self._failure}")

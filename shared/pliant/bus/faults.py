@@ -11,7 +11,7 @@ class FaultLog:
 
     def __init__(self, service: str) -> None:
         self._service = service
-        self._told: dict[str, tuple[int, ...]] = {}
+        self._reported: dict[str, tuple[int, ...]] = {}
 
     def line(self, inputs: Mapping[str, Inbox], outputs: Mapping[str, Outbox]) -> str:
         """A note on the messages skipped since the last call; "" for none."""
@@ -26,6 +26,6 @@ class FaultLog:
         return f"{self._service}: ignored messages: {', '.join(parts)}" if parts else ""
 
     def _new(self, key: str, counts: tuple[int, ...]) -> tuple[int, ...]:
-        before = self._told.get(key, (0,) * len(counts))
-        self._told[key] = counts
+        before = self._reported.get(key, (0,) * len(counts))
+        self._reported[key] = counts
         return tuple(now - then for now, then in zip(counts, before, strict=True))

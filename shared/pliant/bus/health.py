@@ -59,12 +59,12 @@ class Health(Header):
 
 
 def health_key(service: str) -> str:
-    """The key on which a service tells its health, without the session's prefix."""
+    """The key on which a service publishes its health, without the session's prefix."""
     return f"health/{service}"
 
 
 def read_health(sample: zenoh.Sample) -> tuple[str, Health] | None:
-    """The session and the health in a sample; None where it is not one of ours."""
+    """The session and the health in a sample; None if it is not one of ours."""
     if len(sample.payload) > MAX_BYTES:
         return None
     try:

@@ -82,7 +82,7 @@ class Inbox:
         return received
 
     def start_from(self, taken: int) -> None:
-        """Go on behind ``taken`` messages; what waited will come again."""
+        """Continue after ``taken`` messages; what waited will come again."""
         self.taken = taken
         self.waiting.clear()
         self._bytes = 0

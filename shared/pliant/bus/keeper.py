@@ -38,7 +38,7 @@ class Keeper:
     _closing: bool = False
     _greeting: bool = False  # a peer appeared: report our counts
     _done: bool = False
-    _strangers_told: int = 0
+    _strangers_reported: int = 0
     _place: Place = field(default_factory=lambda: Place(-1, {}, {}))
 
     def __post_init__(self) -> None:
@@ -65,10 +65,10 @@ class Keeper:
         self._greeting = True
         self.shared.wake.set()
 
-    def tell(self, entry: InLink, ask: int = NOTHING) -> None:
+    def report(self, entry: InLink, request: int = NOTHING) -> None:
         """Report our counts to a sender."""
         if self.restored:  # before that, what we took is not ours
-            entry.tell(self.shared.peers.incarnation, ask)
+            entry.report(self.shared.peers.incarnation, request)
 
     def all_is_safe(self) -> None:
         """We are done: no sender needs to keep anything for us."""
@@ -77,10 +77,10 @@ class Keeper:
             for entry in self.inputs.values():
                 entry.safe = entry.box.taken
         for entry in self.inputs.values():
-            self.tell(entry)
+            self.report(entry)
 
-    def tell_faults(self) -> None:
-        """Say what, and who, was passed over since this was called last."""
+    def report_faults(self) -> None:
+        """Report what, and who, was passed over since the last call."""
         inputs = {key: entry.box for key, entry in self.inputs.items()}
         outputs = {key: output.box for key, output in self.outputs.items()}
         with self.shared.changed:
@@ -89,8 +89,9 @@ class Keeper:
             self.on_fault(fault)
 
     def _strangers(self) -> list[str]:
-        told, self._strangers_told = self._strangers_told, len(self.shared.peers.strangers)
-        return list(self.shared.peers.strangers.values())[told:]
+        strangers = list(self.shared.peers.strangers.values())
+        reported, self._strangers_reported = self._strangers_reported, len(strangers)
+        return strangers[reported:]
 
     def _run(self) -> None:
         try:
@@ -113,7 +114,7 @@ class Keeper:
             if self._closing:
                 return
             if tick:
-                self._tell_health()
+                self._report_health()
                 self.on_tick()
             if not self.restored:
                 continue
@@ -126,16 +127,16 @@ class Keeper:
                 if tick:
                     output.sent_at_tick = output.box.sent
 
-    def _tell_health(self) -> None:
+    def _report_health(self) -> None:
         inputs = {key: entry.box for key, entry in self.inputs.items()}
         outputs = {key: output.box for key, output in self.outputs.items()}
         shared = self.shared
         with shared.changed:
-            waiting = self.waiting.told(time.monotonic())
+            waiting = self.waiting.description(time.monotonic())
             health = health_of(
                 self.shared.peers.service, shared.peers.incarnation, waiting, inputs, outputs
             )
-        self.tell_faults()
+        self.report_faults()
         shared.session.put(f"{shared.prefix}/{health_key(health.service)}", codec.encode(health))
 
     def _advance_safe(self) -> None:
@@ -154,13 +155,13 @@ class Keeper:
 
     def _keep_input(self, entry: InLink, *, tick: bool, greeting: bool) -> None:
         with self.shared.changed:
-            ask = NOTHING
+            request = NOTHING
             now = time.monotonic()
-            if entry.box.gap and now - entry.asked_at >= _ASK_AGAIN_S:
-                entry.box.gap, entry.asked_at, ask = False, now, NOW
+            if entry.box.gap and now - entry.requested_at >= _ASK_AGAIN_S:
+                entry.box.gap, entry.requested_at, request = False, now, NOW
             elif tick and entry.wanted and not entry.arrived:
-                ask = IF_OLD
+                request = IF_OLD
             if tick:
                 entry.arrived = False
-        if ask or tick or greeting:
-            self.tell(entry, ask)
+        if request or tick or greeting:
+            self.report(entry, request)

@@ -48,26 +48,26 @@ class InLink:
 
     safe: messages that we will never request again.     wanted: the service waits for this topic.
     arrived: whether one came since the last tick.     ended: its end was kept before we started.
-    told: messages taken when we last reported our counts.
-    asked_at: when we requested missing messages.
+    reported: messages taken when we last reported our counts.
+    requested_at: when we requested missing messages.
     """
 
     def __init__(self, shared: Shared, topic: Topic, sender: str, *, reader: str, limit: Window):
         self.topic = topic
         self.sender = sender
         self.box = Inbox(limit.messages, limit.size)
-        self.safe = self.told = 0
-        self.asked_at = float("-inf")
+        self.safe = self.reported = 0
+        self.requested_at = float("-inf")
         self.wanted = self.arrived = self.ended = False
         self._shared = shared
         self._credit = _publisher(shared, f"credit/{topic.key}/{reader}")
         key = f"{shared.prefix}/{topic.key}"
         self._held = shared.session.declare_subscriber(key, directly(self._on_sample))
 
-    def tell(self, incarnation: int, ask: int = NOTHING) -> None:
+    def report(self, incarnation: int, request: int = NOTHING) -> None:
         """Report our counts to the sender."""
-        self.told = taken = self.box.taken
-        self._credit.put(_CREDIT.pack(incarnation, taken, self.safe, ask))
+        self.reported = taken = self.box.taken
+        self._credit.put(_CREDIT.pack(incarnation, taken, self.safe, request))
 
     def start_from(self, taken: int) -> None:
         """Continue after ``taken`` messages."""
@@ -103,7 +103,7 @@ class InLink:
             self.box.refuse(why)
 
     def look_into(self, received: Received, *, views: bool = False) -> Received:
-        """The message with what is in it.  Raises MessageError where it does not fit the topic."""
+        """The message with what is in it.  Raises MessageError if it does not fit the topic."""
         topic = topics.STREAM_END if received.is_end else self.topic
         message = codec.decode(topic.message, received.data, max_bytes=topic.max_bytes, views=views)
         if isinstance(message, StreamEnd) and received.is_end:
@@ -158,7 +158,7 @@ class OutLink:
             return
         with self._sending:
             with self._shared.changed:
-                messages = self.box.asked_for()
+                messages = self.box.take_requested()
             for message in messages:
                 self._put(message)
 
@@ -175,14 +175,15 @@ class OutLink:
             if not fits:
                 self.box.refused += 1
                 return
-            incarnation, taken, safe, ask = _CREDIT.unpack(payload)
-            if ask > NOW or not shared.peers.is_known(reader, incarnation):
+            incarnation, taken, safe, request = _CREDIT.unpack(payload)
+            if request > NOW or not shared.peers.is_known(reader, incarnation):
                 self.box.refused += 1
                 return
             left = shared.peers.left(reader)
             came_back = self.box.credit(reader, incarnation, taken, safe, left)
-            asked = came_back or ask == NOW or (ask == IF_OLD and taken < self.sent_at_tick)
-            if asked and taken < self.box.sent:
+            is_old = request == IF_OLD and taken < self.sent_at_tick
+            is_requested = came_back or request == NOW or is_old
+            if is_requested and taken < self.box.sent:
                 self.box.asking.add(reader)
                 shared.wake.set()
             shared.changed.notify_all()
@@ -191,7 +192,7 @@ class OutLink:
 def received(topic: Topic, sample: zenoh.Sample) -> Received | None:
     """The messages that a mere listener receives: possibly twice, and not decoded.
 
-    None where it is no message of a bus.
+    None if it is no message of a bus.
     """
     envelope = sample.attachment.to_bytes() if sample.attachment is not None else b""
     if len(envelope) != ENVELOPE.size or len(sample.payload) > topic.max_bytes:

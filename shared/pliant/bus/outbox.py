@@ -86,7 +86,7 @@ class Outbox:
         return message
 
     def start_from(self, sequence: int) -> None:
-        """Go on from a number, as after a restart.  Nothing may have been added yet."""
+        """Continue from a number, as after a restart.  Nothing may have been added yet."""
         self.sent = sequence
 
     def credit(
@@ -178,7 +178,7 @@ class Outbox:
         """Messages held here: at most a window and what the slowest checkpoint lies behind."""
         return len(self._kept)
 
-    def asked_for(self) -> tuple[Numbered, ...]:
+    def take_requested(self) -> tuple[Numbered, ...]:
         """The messages that readers have requested and still lack, once.
 
         By their latest report: delayed reports arrive together, and after the last of them the
@@ -189,7 +189,7 @@ class Outbox:
         return self.again(min(taken)) if taken else ()
 
     def again(self, sequence: int) -> tuple[Numbered, ...]:
-        """Everything from a number on.  Raises BusError where it is not kept any more."""
+        """Everything from a number on.  Raises BusError if it is not kept any more."""
         if sequence >= self.sent:
             return ()
         if not self._kept or self._kept[0].sequence > sequence:

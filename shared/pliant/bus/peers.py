@@ -1,8 +1,8 @@
 """The other services in the session, by their liveliness tokens.
 
-A token says ``ready/<service>/<incarnation>/<wire version>/<release>+<schema>``.  The incarnation
-tells one start of a service from the next, so that the late end of an old token is not taken for
-the death of the service that has come back.  A state machine: no socket, the time is handed in.
+A token is ``ready/<service>/<incarnation>/<wire version>/<release>+<schema>``.  The incarnation
+differs in each start of a service, so that the late end of an old token is not mistaken for the
+death of the restarted service.  A state machine without a socket; the caller passes the time.
 """
 
 import re
@@ -147,8 +147,8 @@ class Peers:
             raise self.failure
 
     def raise_if_refused(self) -> None:
-        """Raise BusError where versions do not fit or a newer one of us is there, SessionOverError
-        where there is nothing to wait for any more; and what a thread of the bus failed of."""
+        """Raise BusError if versions do not fit or a newer one of us is there, SessionOverError
+        if there is nothing to wait for any more; and what a thread of the bus failed of."""
         self.raise_if_failed()
         if self.over:
             raise SessionOverError(f"{self.service}: the session is over")

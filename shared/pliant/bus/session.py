@@ -68,7 +68,7 @@ class Identity:
     def in_folder(cls, folder: Path, name: str) -> "Identity":
         """The identity ``name`` in a folder that ``pliant certs`` made.
 
-        Raises BusError where it is not there.
+        Raises BusError if it is not there.
         """
         own = cls(folder / "ca.pem", folder / f"{name}.pem", folder / f"{name}.key")
         for path in (own.authority, own.certificate, own.key):
@@ -179,7 +179,7 @@ class LocalRouter:
     """A router for the processes of one user: at a Unix socket in a folder of its own.
 
     On a loopback port, which every user of the machine reaches, where one is given or no such
-    socket can be had: ``note`` says why then, and is "" else.
+    socket can be had: ``note`` then has the reason, otherwise "".
     """
 
     def __init__(self, port: int | None = None) -> None:
@@ -259,7 +259,7 @@ def free_endpoint() -> str:
 
 
 def is_beyond_loopback(endpoint: str) -> bool:
-    """Whether other machines may reach an endpoint that is listened on, as far as it says."""
+    """Whether the text of a listening endpoint allows connections from other machines."""
     protocol, _, address = endpoint.partition("/")
     if protocol.startswith("unix"):
         return False

@@ -36,7 +36,7 @@ class Waiting:
         """The wait is over."""
         self.text = ""
 
-    def told(self, now: float) -> str:
+    def description(self, now: float) -> str:
         """A description of the wait, with its length if it is long; "" without one."""
         waited_s = now - self.since
         if not self.text or waited_s < _WORTH_TELLING_S:
@@ -90,7 +90,7 @@ class Waits:
                     self.spent_s[name] = self.spent_s.get(name, 0.0) + spent_s
 
     def for_message(self, entries: Sequence[InLink], deadline: float | None) -> InLink | None:
-        """The input whose message came first; None where none comes in time.  Raises BusError."""
+        """The input whose message came first; None if none comes in time.  Raises BusError."""
         with self.changed:
             self.peers.raise_if_failed()
             while not any(entry.box.waiting for entry in entries):
@@ -118,4 +118,4 @@ class Waits:
             while len(self.peers.missing(senders)) < len(senders):
                 if time.monotonic() >= deadline:
                     return
-                self.changed.wait(TICK_S)  # the keeper tells our counts again meanwhile
+                self.changed.wait(TICK_S)  # the keeper repeats our counts meanwhile

@@ -1,7 +1,7 @@
 """The bus over Zenoh, with our own flow control and our own delivery.
 
 Zenoh's BLOCK is no guarantee (a reader that stalls longer than the transport's patience loses
-messages and ``put`` never says so; a router that dies takes what it holds with it), hence sequence
+messages and ``put`` never fails; a router that dies takes what it holds with it), hence sequence
 numbers and credits: a reader reports how many messages of a topic it has taken, and how many it
 will never request again.  A sender never has more than a window on the way to its slowest required
 reader, and keeps messages that may be requested.  A reader requests missing messages.  So each
@@ -12,8 +12,8 @@ for the tokens of its required readers before its first message.  A peer that st
 than our patience is named in an error, so that every wait ends.
 
 With checkpoints a service that died continues where it was: ``restore`` puts it back to the newest
-checkpoint that its readers allow, senders send again what came after, and what it makes a second
-time is passed over by those who had it.
+checkpoint that its readers allow.  Senders repeat what came after it, and readers skip messages
+that they already have.
 
 Callbacks only append to queues and notify: no Zenoh call is ever made inside one.  A thread of its
 own (``keeper.py``) reports counts once a second and repeats messages.
@@ -94,7 +94,7 @@ class ZenohBus:
         lags = lags or {}
         own_lag = lags.get(service, Window(0, 0))
         # A lagging reader is waited for by its reports, which cover all messages.
-        self._tell_every = 1 if service in lags else max(1, window // 4)
+        self._report_every = 1 if service in lags else max(1, window // 4)
         self._checkpoints = checkpoints
         self._packed = frozenset(packed)
         self._disturb = disturb or (lambda: None)
@@ -157,7 +157,7 @@ class ZenohBus:
                 self._keeper.all_is_safe()
         finally:
             self._keeper.stop()
-            self._keeper.tell_faults()  # of the last second
+            self._keeper.report_faults()  # of the last second
             if self._checkpoints is not None:
                 self._checkpoints.close()
             self._session.close()  # type: ignore[no-untyped-call]
@@ -166,11 +166,11 @@ class ZenohBus:
         """Wait until no other start of us is there: the token of one that died may outlive it."""
         name, session = self._peers.service, self._prefix.removeprefix("pliant/")
         tokens = f"{self._prefix}/ready/{name}/**"
-        enough, said = time.monotonic() + TOKEN_LEASE_S, False
+        enough, has_reported = time.monotonic() + TOKEN_LEASE_S, False
         while any(reply.ok is not None for reply in self._session.liveliness().get(tokens)):
-            if not said:
+            if not has_reported:
                 say(f"{name}: session {session} already has a {name}: waiting until it ends")
-                said = True
+                has_reported = True
             if time.monotonic() > enough or self._waits.interrupted():
                 self._session.close()  # type: ignore[no-untyped-call]
                 raise BusError(f"session {session} already has a {name}: choose another --session")
@@ -198,7 +198,7 @@ class ZenohBus:
 
         may_lag: readers in whose window it takes no room, where ``lags`` names them; with it no
         more than that is on the way to them.
-        Raises MessageError where the message is larger than its topic's readers take.
+        Raises MessageError if the message is larger than its topic's readers take.
         """
         payload = codec.encode(message, packed=topic in self._packed)
         if len(payload) > topic.max_bytes:
@@ -271,7 +271,7 @@ class ZenohBus:
             assert received is not None
             if self._checkpoints is None:
                 entry.safe = entry.box.taken
-            self._tell_now_and_then(entry, received)
+            self._report_taken(entry, received)
             if received.is_end:
                 return
             assert received.message is not None
@@ -298,7 +298,7 @@ class ZenohBus:
             received = self._take(entries, timeout_s, views=True)
             if received is not None:
                 entry = self._inputs[received.topic.key]
-                self._tell_now_and_then(entry, received)
+                self._report_taken(entry, received)
                 if received.is_end:
                     entries = [entry for entry in entries if entry.topic is not received.topic]
             yield received
@@ -306,11 +306,11 @@ class ZenohBus:
     def acknowledge(self) -> None:
         """Everything taken so far is on the disk: senders need not keep it any longer."""
         with self._changed:
-            told = [entry for entry in self._inputs.values() if entry.safe != entry.box.taken]
-            for entry in told:
+            reported = [entry for entry in self._inputs.values() if entry.safe != entry.box.taken]
+            for entry in reported:
                 entry.safe = entry.box.taken
-        for entry in told:
-            self._keeper.tell(entry)
+        for entry in reported:
+            self._keeper.report(entry)
 
     def _take(
         self, entries: Sequence[InLink], timeout_s: float | None = None, *, views: bool = False
@@ -388,13 +388,13 @@ class ZenohBus:
 
     # -- what comes in -------------------------------------------------------------------------
 
-    def _tell_now_and_then(self, entry: InLink, received: Received) -> None:
+    def _report_taken(self, entry: InLink, received: Received) -> None:
         # Each credit wakes the router and the sender, while the service waits: for most, a
         # quarter of the window at a time is enough.
         box, newest_wins = entry.box, entry.topic.newest_wins
         all_taken = newest_wins and not box.waiting
-        if received.is_end or all_taken or box.taken - entry.told >= self._tell_every:
-            self._keeper.tell(entry)
+        if received.is_end or all_taken or box.taken - entry.reported >= self._report_every:
+            self._keeper.report(entry)
 
     def _on_stop(self, _: zenoh.Sample) -> None:
         self.stop_requested = True

@@ -1,9 +1,9 @@
 """Numba's cache on disk, which notices a change in any module that a kernel is built from.
 
-Numba stamps a cached kernel with the text of the file that it stands in.  A helper or a constant
-from another file is compiled into the kernel all the same, so that after an edit or an upgrade an
-old kernel would continue running, silently.  Here the stamp covers every module of ours that the
-kernel's module imports, directly or not.
+Numba stamps a cached kernel with the text of the file that it stands in.  But helpers and constants
+from other files are compiled into the kernel, too.  So after an edit or an upgrade an old kernel
+would silently stay in use.  Here the stamp covers every module of ours that the kernel's module
+imports, directly or not.
 
 Kernels are kept in NUMBA_CACHE_DIR, else beside their sources, else in Pliant's cache folder.
 """
@@ -58,7 +58,7 @@ class SourcesCache(FunctionCache):
     _impl_class = _Place
 
     def __init__(self, function: Any) -> None:
-        """Raises PliantError where no folder can be written."""
+        """Raises PliantError if no folder can be written."""
         try:
             super().__init__(function)
         except RuntimeError:  # of Numba, where no place will do
@@ -76,7 +76,7 @@ class SourcesCache(FunctionCache):
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """A kernel from disk; None where it is not there.
+        """A kernel from disk; None if it is not there.
 
         Numba registers all that a compiler may need first, a tenth of a second in every process:
         machine code needs the functions that count references, no more.  Who compiles registers

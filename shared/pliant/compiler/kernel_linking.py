@@ -17,7 +17,7 @@ import numba.core.codegen
 def keep_copies_apart() -> None:
     """Have every kernel of this process call the helpers in its own object file.
 
-    Repeated calls do nothing.  Raises AttributeError where Numba finishes modules otherwise.
+    Repeated calls do nothing.  Raises AttributeError if Numba finishes modules otherwise.
     """
     library: Any = numba.core.codegen.JITCodeLibrary
     finish = library._finalize_final_module

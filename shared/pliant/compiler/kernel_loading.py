@@ -14,7 +14,7 @@ import numba.core.codegen
 def parse_when_needed() -> None:
     """Have this process parse the intermediate code of loaded kernels only where it is linked.
 
-    Repeated calls do nothing.  Raises AttributeError where Numba loads kernels otherwise.
+    Repeated calls do nothing.  Raises AttributeError if Numba loads kernels otherwise.
     """
     library: Any = numba.core.codegen.JITCodeLibrary
     load, link = library._unserialize.__func__, library._get_module_for_linking
@@ -41,7 +41,7 @@ def parse_when_needed() -> None:
         return link(self)
 
     def address_of(self: Any, name: str) -> Any:
-        if getattr(self, "unparsed", None) is not None:  # numba asks its list of symbols first
+        if getattr(self, "unparsed", None) is not None:  # numba looks in its list of symbols first
             return self._codegen._engine.get_function_address(name)
         return address(self, name)
 

@@ -1,9 +1,9 @@
 """Numba's own subroutines, compiled with the options of the kernel that calls them.
 
-What Numba does not write out in a kernel, ``x ** n`` for one, it compiles as a subroutine, with the
-arithmetic of the kernel that needs it first, and keeps it for all kernels of the process.  So a
-strict kernel would round as a fast one does, or the other way round, depending on which was
-compiled first.  Here kernels share a subroutine only with kernels of the same options.
+What Numba does not write out in a kernel, ``x ** n`` for example, it compiles as a subroutine.
+That has the arithmetic of the first kernel that needs it, and is kept for all kernels of the
+process.  So a strict kernel would round as a fast one does, or the other way round, depending on
+which was compiled first.  Here kernels share a subroutine only with kernels of the same options.
 """
 
 from typing import Any
@@ -14,7 +14,7 @@ from numba.core.base import BaseContext
 def keep_subroutines_apart() -> None:
     """Have kernels with other options compile subroutines of their own.
 
-    Repeated calls do nothing.  Raises AttributeError where Numba keeps subroutines otherwise.
+    Repeated calls do nothing.  Raises AttributeError if Numba keeps subroutines otherwise.
     """
     target: Any = BaseContext
     subtarget = target.subtarget

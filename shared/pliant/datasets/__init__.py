@@ -174,9 +174,9 @@ def formats() -> dict[str, SourceFormat]:
         try:
             kind: object = point.load()
         except Exception as error:  # of foreign code
-            said = shortened(f"{type(error).__name__}: {error}".split("\n")[0], 200)
+            reason = shortened(f"{type(error).__name__}: {error}".split("\n")[0], 200)
             raise DatasetError(
-                f"the source format {point.name} ({point.value}) does not load: {said}; fix or "
+                f"the source format {point.name} ({point.value}) does not load: {reason}; fix or "
                 "uninstall its package"
             ) from error
         if not isinstance(kind, SourceFormat):
@@ -259,7 +259,7 @@ def notes_on(dataset: Dataset) -> list[str]:
 
 
 def check_start(dataset: Dataset) -> None:
-    """Raise DatasetError where a source that is opened in part ends before the part begins."""
+    """Raise DatasetError if a source that is opened in part ends before the part begins."""
     whole = dataset
     while isinstance(whole, SmallerImages | StaticallyMasked):
         whole = whole.source
@@ -274,7 +274,7 @@ HELP = "see `pliant run --help` and docs/sources.md for supported sources"
 def sources_in(folder: Path, *, but: Path) -> list[Path]:
     """The sources that lie directly in a folder, by name.  but: one that is none, as results are.
 
-    Raises DatasetError where there are none, or the folder is one itself.
+    Raises DatasetError if there are none, or the folder is one itself.
     """
     if any(kind.recognises(str(folder)) for kind in formats().values()):
         raise DatasetError(f"{folder}: is itself a sequence: use `pliant run {folder}`")

@@ -23,15 +23,14 @@ class SourceFrame:
     the others of ``raw_pixels.RAW_BYTES``).
     data: bytes as they are in the file, or the raw pixels.
     width, height: of raw pixels; 0 for file formats, which contain their size.
-    made_from: "" as it came; else what it was before, for people; of a frame without data, why it
-    has none.
-    clip_frame: number of the frame of a video file that it is made from; -1: of none.
-    depth: the file of the depth map that belongs to it, as it is; b"" where there is none.
-    mask: an image file of the part that is used; b"": all of it.
-    number: in the source, where only a part of that is taken; -1: ``index``.
-    name: of the file that it comes from; "" where it has none; tells no frames apart.
-    captured_s: in live mode, when it came or was due by the clock of this machine; tells none
-    apart, either.
+    made_from: description of the original if the frame was converted; "" otherwise; of a frame
+    without data, the reason.
+    clip_frame: number of the frame in its video file; -1: not from a video file.
+    depth: content of the file with its depth map; b"" without one.
+    mask: content of an image file that marks the used part; b"": all of it.
+    number: in the source, if only a part of the source is used; -1: ``index``.
+    name: of its file; "" without one; not compared.
+    captured_s: in live mode, when it came or was due by the clock of this machine; not compared.
     """
 
     index: int
@@ -50,27 +49,27 @@ class SourceFrame:
 
     @property
     def dropped(self) -> bool:
-        """Whether it was passed over on purpose (an empty file is not: that one is broken)."""
+        """Whether it was skipped on purpose; a frame of an empty file is broken, not dropped."""
         return self.encoding == ""
 
     def broken(self, why: str) -> "SourceFrame":
-        """This frame as one of which nothing can be used.  why: for people."""
+        """Return the frame as a broken one, without data.  why: the reason, for people."""
         nothing = {"encoding": "unknown", "width": 0, "height": 0, "clip_frame": -1}
         return replace(self, **nothing, data=b"", depth=b"", mask=b"", made_from=why)
 
     @property
     def called(self) -> str:
-        """How it is found by people."""
+        """Its name in messages."""
         return f"frame {self.index}" if self.number < 0 else f"frame {self.number} of the source"
 
     def without_data(self) -> "SourceFrame":
-        """This frame passed over: its number and time stay."""
+        """Return the frame as a skipped one, with its number and time."""
         nothing = {"encoding": "", "width": 0, "height": 0, "clip_frame": -1}
         return replace(self, **nothing, data=b"", depth=b"", mask=b"")
 
 
 class Dataset(Protocol):
-    """A source of frames.  Iterating starts it from its first frame, each time anew."""
+    """A source of frames.  Each iteration starts with the first frame."""
 
     @property
     def name(self) -> str:
@@ -84,7 +83,7 @@ class Dataset(Protocol):
 
     @property
     def is_live(self) -> bool:
-        """Frames come whether a reader is ready or not."""
+        """Whether frames arrive at their own pace, even if no reader is ready."""
         ...
 
     @property
@@ -94,11 +93,11 @@ class Dataset(Protocol):
 
     @property
     def ground_truth_path(self) -> Path | None:
-        """The file of true poses that came with it."""
+        """The file with its ground-truth poses; None without one."""
         ...
 
     def __iter__(self) -> Iterator[SourceFrame]:
-        """The frames.  Raises DatasetError where the source itself fails, not for a bad frame."""
+        """Yield the frames.  Raises DatasetError if the source fails, not for a broken frame."""
         ...
 
 
@@ -106,7 +105,7 @@ VIDEO_SUFFIXES = (
     *(".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".m2ts", ".ts"),
     *(".wmv", ".flv", ".ogv", ".3gp", ".mjpeg"),
 )
-"""A file of these endings in a folder is a clip: of one that a user names, OpenCV decides."""
+"""Endings of clips in a folder.  For a file that a user names, OpenCV decides."""
 
 _MAGIC = (
     (b"\xff\xd8\xff", "jpeg"),
@@ -120,7 +119,7 @@ _MAGIC = (
 
 
 def encoding_of(data: bytes) -> str:
-    """The format of the bytes of an image file by its first bytes; names of files do lie."""
+    """Return the format of an image file by its first bytes: its name may be wrong."""
     for magic, encoding in _MAGIC:
         if data.startswith(magic):
             return encoding

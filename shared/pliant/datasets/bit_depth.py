@@ -72,7 +72,7 @@ def _may_be_deep(frame: SourceFrame) -> bool:
 
 
 def _deep(frame: SourceFrame) -> NDArray[np.uint16] | None:
-    """Pixels of 16 bits, BGR where a file has colour; None where it has others, or none."""
+    """Pixels of 16 bits, BGR where a file has colour; None if it has others, or none."""
     if is_deep(frame.encoding):
         size = RAW_BYTES[frame.encoding] * frame.width * frame.height
         if not size or len(frame.data) != size:

@@ -125,9 +125,9 @@ def calibration_from_fov(
 
     Raises CalibrationError for a field of view that a pinhole camera cannot have.
     """
-    said = fov_deg is not None
-    side = width if said else max(width, height / pixel_aspect)
-    fov_deg = fov_deg if said else UNSAID_FOV_DEG
+    is_given = fov_deg is not None
+    side = width if is_given else max(width, height / pixel_aspect)
+    fov_deg = fov_deg if is_given else UNSAID_FOV_DEG
     if not 1.0 <= fov_deg <= 170.0:  # also refuses NaN
         raise CalibrationError(
             f"--fov {fov_deg:g}: the horizontal field of view must be 1 to 170 degrees; "
@@ -142,7 +142,7 @@ def calibration_from_fov(
         fy=focal * pixel_aspect,
         cx=0.5 * (width - 1),
         cy=0.5 * (height - 1),
-        focal_sigma=SAID_SIGMA if said else UNSAID_SIGMA,
+        focal_sigma=SAID_SIGMA if is_given else UNSAID_SIGMA,
     )
 
 

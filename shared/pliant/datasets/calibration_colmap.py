@@ -62,8 +62,10 @@ def colmap(text: str, wanted: Wanted) -> Keys:
 
 def nerfstudio(content: Keys, wanted: Wanted) -> Keys:
     """The camera of all images; a file that gives each its own is read where all are the same."""
-    said = content.get("camera_model", "OPENCV_FISHEYE" if content.get("is_fisheye") else "OPENCV")
-    model, _ = _known_colmap(str(said))
+    model_name = content.get(
+        "camera_model", "OPENCV_FISHEYE" if content.get("is_fisheye") else "OPENCV"
+    )
+    model, _ = _known_colmap(str(model_name))
     content = {**_of_all_frames(content), **content}
     flat: Keys = {"model": model, **dict.fromkeys(COEFFICIENTS[model], 0.0)}
     names = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}

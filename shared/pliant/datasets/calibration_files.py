@@ -67,7 +67,7 @@ def calibration_from_camera_info(content: Keys) -> Calibration:
 
 
 def check_size(calibration: Calibration, image_size: tuple[int, int] | None, where: str) -> None:
-    """Raise CalibrationError where the images are not of the size that the calibration is for."""
+    """Raise CalibrationError if the images are not of the size that the calibration is for."""
     size = (calibration.width, calibration.height)
     if image_size is not None and image_size != size:
         raise CalibrationError(

@@ -69,7 +69,7 @@ def _keys(text: str) -> Keys:
 
 
 def _json(text: str) -> Any:
-    """None where it is none.  YAML reads JSON, too, but takes minutes for a thousand poses."""
+    """None if it is none.  YAML reads JSON, too, but takes minutes for a thousand poses."""
     if not text.lstrip().startswith("{"):
         return None
     try:
@@ -119,7 +119,7 @@ def _kalibr(content: Keys, wanted: Wanted) -> Keys:
 
 def _of_chain(cameras: Keys, wanted: Wanted) -> str:
     """Which camera of a chain took the images: the one the user names, or their topic or folder,
-    or their size.  Raises CalibrationError where none of them does."""
+    or their size.  Raises CalibrationError if none of them does."""
     names = list(cameras)
     if wanted.camera:
         named = [
@@ -155,47 +155,47 @@ def _euroc(content: Keys, wanted: Wanted) -> Keys:
             "lens: with pinhole-equi)"
         )
     size = _numbers(content, "resolution", 2) if "resolution" in content else None
-    return _lens(content, _numbers(content, "intrinsics", 4), size, _said_model(content))
+    return _lens(content, _numbers(content, "intrinsics", 4), size, _model_name(content))
 
 
 def _opencv(content: Keys, wanted: Wanted) -> Keys:
-    """Its samples name no model: the count of the coefficients, or ``fisheye_model``, tells."""
+    """Its files name no model: the number of coefficients, or ``fisheye_model``, determines it."""
     K = _numbers(content, _first(content, _MATRIX), 9)
     width, height = (content.get(_first(content, names)) for names in _SIZE)
-    model = _said_model(content)
+    model = _model_name(content)
     if not model:
         model = "fisheye" if content.get("fisheye_model") else "rational_polynomial"
     size = None if width is None or height is None else [width, height]
     return _lens(content, [K[0], K[4], K[2], K[5]], size, model)
 
 
-def _said_model(content: Keys) -> str:
-    said = content.get("distortion_model")
+def _model_name(content: Keys) -> str:
+    model_name = content.get("distortion_model")
     coefficients = _first(content, _COEFFICIENTS)
-    if not said and coefficients and not _numbers(content, coefficients, None):
+    if not model_name and coefficients and not _numbers(content, coefficients, None):
         return "none"
-    return str(said or "").lower()
+    return str(model_name or "").lower()
 
 
-def _lens(content: Keys, intrinsics: list[Any], size: list[Any] | None, said: str) -> Keys:
+def _lens(content: Keys, intrinsics: list[Any], size: list[Any] | None, model_name: str) -> Keys:
     key = _first(content, _COEFFICIENTS)
     if not key:
         raise CalibrationError(
             "no distortion_coefficients: add what is missing (zeros if rectified)"
         )
-    model, coefficients = _DISTORTION.get(said), _numbers(content, key, None)
+    model, coefficients = _DISTORTION.get(model_name), _numbers(content, key, None)
     if model is None:
         raise CalibrationError(
-            f"distortion_model {shown(said)} is not supported: calibrate again with radtan or "
-            "equidistant"
+            f"distortion_model {shown(model_name)} is not supported: calibrate again with radtan "
+            "or equidistant"
         )
     names = COEFFICIENTS[model]
     while len(coefficients) > len(names) and coefficients[-1] == 0:
         coefficients = coefficients[:-1]  # more terms than the model has, if they are zero
     if len(coefficients) > len(names):
         raise CalibrationError(
-            f"{len(coefficients)} distortion coefficients, but {said} is supported with at most "
-            f"{len(names)} ({' '.join(names)}): calibrate again with those"
+            f"{len(coefficients)} distortion coefficients, but {model_name} is supported with at "
+            f"most {len(names)} ({' '.join(names)}): calibrate again with those"
         )
     if model == "pinhole-rational":
         coefficients = [*coefficients, *[0.0] * (len(names) - len(coefficients))]
@@ -245,11 +245,11 @@ def _orb_slam(content: Keys, wanted: Wanted) -> Keys:
             "is for a stereo pair that ORB-SLAM rectifies first (LEFT.K): give the calibration of "
             "the images as they are, or of one camera"
         )
-    said = str(content.get("Camera.type", "PinHole"))
-    model = _ORB_SLAM.get(said.lower())
+    model_name = str(content.get("Camera.type", "PinHole"))
+    model = _ORB_SLAM.get(model_name.lower())
     if model is None:
         raise CalibrationError(
-            f"Camera.type {shown(said)} is not supported: calibrate again with PinHole or "
+            f"Camera.type {shown(model_name)} is not supported: calibrate again with PinHole or "
             "KannalaBrandt8"
         )
     camera = "Camera1" if "Camera1.fx" in content else "Camera"

@@ -23,7 +23,7 @@ _COLMAP_MODELS = (
 def calibration_text(file: Path) -> str:
     """The text of a file; of a COLMAP cameras.bin that of its cameras.txt.
 
-    Raises CalibrationError, and OSError where it cannot be read.
+    Raises CalibrationError, and OSError if it cannot be read.
     """
     limit = _MAX_JSON_BYTES if file.suffix == ".json" else _MAX_BYTES
     if file.is_file() and file.stat().st_size > limit:

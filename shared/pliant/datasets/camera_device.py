@@ -1,7 +1,7 @@
 """Cameras that are attached: ``camera:0``, or just ``0``, with a calibration or a field of view.
 
-The device is opened once to see that it is there and how large its images are, closed, and opened
-again to stream, so that a check before a run does not keep it from the process that reads it.
+The device is opened once to find out whether it exists and how large its images are, and closed.
+It is opened again to stream.  So a check before a run does not block the process that reads it.
 """
 
 import re
@@ -57,7 +57,7 @@ class CameraDevice:
         open_device: Callable[[int], Capture] = _open_device,
         clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Raises DatasetError where there is no such camera, and CalibrationError.
+        """Raises DatasetError if there is no such camera, and CalibrationError.
 
         open_device, clock_ns: for tests.
         """

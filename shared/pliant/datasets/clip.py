@@ -24,7 +24,7 @@ class Clip:
     """A video file that is sent in pieces, and watched for changes from then on."""
 
     def __init__(self, file: Path) -> None:
-        """Raises DatasetError where it cannot be read."""
+        """Raises DatasetError if it cannot be read."""
         self._path = file
         with self._reading():
             self.size = file.stat().st_size
@@ -72,7 +72,7 @@ class Clip:
 def clip_of(source: Dataset) -> Clip | None:
     """The video behind a source, where its file is no larger than the frames that are taken of it.
 
-    Raises DatasetError where it cannot be read.
+    Raises DatasetError if it cannot be read.
     """
     origin, parts = source, list[Part]()
     while isinstance(origin, SmallerImages | Excerpt | Masked | StaticallyMasked):

@@ -5,8 +5,8 @@
 
 or, without that list, the right images of a stereo pair: see ``pliant.datasets.stereo``.
 
-A depth map belongs to the image that is nearest in time, if that is within 20 ms (as in the TUM
-benchmark's tools) and it is the nearest to that image.
+A depth map belongs to an image if each is nearest in time to the other, within 20 ms (as in the TUM
+benchmark's tools).
 """
 
 from collections.abc import Sequence
@@ -40,8 +40,8 @@ def with_depth(
 ) -> Sequence[ListedImage]:
     """The images with the depth maps that are wanted of them.
 
-    Raises DatasetError where there is no list or nothing in it belongs to an image, and
-    CalibrationError where the unit of the depth maps is not known.
+    Raises DatasetError if there is no list or nothing in it belongs to an image, and
+    CalibrationError if the unit of the depth maps is not known.
     """
     images = listed.images
     if spec.depth == "none":
@@ -117,7 +117,7 @@ class DepthRectifier:
         """(H, W) metres along the optical axis, 0 where nothing was measured.
 
         Pixels are taken as they are, the nearest one: between two surfaces there is nothing.
-        Raises BrokenFrame where the bytes are no depth map, or one of another size.
+        Raises BrokenFrame if the bytes are no depth map, or one of another size.
         """
         if self._depth is None:
             raise BrokenFrame(f"frame {frame}: a depth map without depth_scale in the calibration")

@@ -54,7 +54,7 @@ class Excerpt:
     def __init__(self, source: Dataset, part: Part, *, first_depth_only: bool = False) -> None:
         """first_depth_only: of depth maps that come along, only the first is delivered.
 
-        Raises DatasetError where the end is not after the start.
+        Raises DatasetError if the end is not after the start.
         """
         if 0.0 < part.end_s <= part.start_s:
             raise DatasetError(f"--end {part.end_s:g}: must be after --start {part.start_s:g}")
@@ -77,7 +77,7 @@ class Excerpt:
             yield replace(chosen, index=index, number=number, depth=depth)
 
     def _within(self) -> Iterator[SourceFrame]:
-        """Raises DatasetError where there is none."""
+        """Raises DatasetError if there is none."""
         part, first_ns, time_s, count = self.part, 0, 0.0, 0
         for frame in self.source:
             first_ns = first_ns if frame.index else frame.stamp_ns
@@ -98,7 +98,7 @@ class Excerpt:
             )
 
     def check_start(self) -> None:
-        """Raise DatasetError where the source ends before the start, in no time if it can tell."""
+        """Raise DatasetError if the source ends before the start, in no time if it can tell."""
         origin = self._origin
         if isinstance(origin, ImageFiles):
             if origin.length_s < self.part.start_s:

@@ -100,13 +100,13 @@ def open_bare_folder(spec: SourceSpec) -> Dataset:
     calibration = choose_calibration(
         spec, image_size(untimed), found=calibration_in(folder, inner), where=spec.location
     )
-    images, told = _timed(paths, calibration.fps)
+    images, more_notes = _timed(paths, calibration.fps)
     return ImageFiles(
         name=folder.resolve().name,
         images=images,
         calibration=calibration,
         ground_truth_path=existing(folder / GROUND_TRUTH_NAME),
-        notes=[*notes, *told],
+        notes=[*notes, *more_notes],
     )
 
 

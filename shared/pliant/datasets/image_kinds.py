@@ -79,9 +79,9 @@ def images_of_one_kind(folder: Path) -> tuple[list[Path], list[str]]:
     chosen = _choose(kinds)
     left_out = {kind: paths for kind, paths in kinds.items() if kind not in chosen}
     if left_out:
-        told = ", ".join(f"{len(paths)} {shortened(kind)}" for kind, paths in left_out.items())
+        skipped = ", ".join(f"{len(paths)} {shortened(kind)}" for kind, paths in left_out.items())
         used = ", ".join(shortened(kind) for kind in chosen)
-        notes.append(f"{folder.name}: using the images {used}; skipping {told}")
+        notes.append(f"{folder.name}: using the images {used}; skipping {skipped}")
     return [path for path in files if _kind(path) in chosen], notes
 
 

@@ -72,16 +72,18 @@ def read_list(file: Path, folder: Path, *, unit: str = "seconds") -> ImageList:
         )
     stamps, notes = stamps_of([(row.line, row.time) for row in rows], file, unit)
     images = [ListedImage(stamp_ns=t, path=row.path) for t, row in zip(stamps, rows, strict=True)]
-    images, told = mended(images, [row.line for row in rows], file)
+    images, more_notes = mended(images, [row.line for row in rows], file)
     if missing:
         of = f"{counted(len(missing), 'file')} of {len(rows)}"
-        told.append(
+        more_notes.append(
             f"{file.name}: {of} (the first in line {missing[0].line}) are missing and count "
             "as broken"
         )
     others = [row.other for row in rows if row.other is not None]
     return ImageList(
-        images, others if len(others) == len(rows) else [], [*notes, *told, *_unlisted(file, rows)]
+        images,
+        others if len(others) == len(rows) else [],
+        [*notes, *more_notes, *_unlisted(file, rows)],
     )
 
 
@@ -120,7 +122,7 @@ def mended(
 ) -> tuple[list[ListedImage], list[str]]:
     """The images with increasing times, and a note where some did not increase.
 
-    Those become broken frames between the others.  Raises DatasetError where they are many.
+    Those become broken frames between the others.  Raises DatasetError if they are many.
     """
     stamps = [image.stamp_ns for image in images]
     good = set(increasing(stamps))
@@ -141,15 +143,15 @@ def mended(
             found[each] = replace(images[each], stamp_ns=between_ns, fault=why_wrong(stamps[each]))
         last_ns, waiting = stamps[row], []
     first = next(row for row in range(len(stamps)) if found[row].fault)
-    told = (
+    more_notes = (
         f"{file.name}: the times of {counted(wrong, 'image')} do not increase (the first in line "
         f"{lines[first]}), and count as broken"
     )
-    return found, [told]
+    return found, [more_notes]
 
 
 def inside(folder: Path, name: str, where: str) -> Path:
-    """The path of a listed file.  Raises DatasetError where it would leave the folder."""
+    """The path of a listed file.  Raises DatasetError if it would leave the folder."""
     normal = os.path.normpath(name)
     if "\0" in name or os.path.isabs(name) or normal.split(os.sep)[0] == "..":
         raise DatasetError(

@@ -71,8 +71,8 @@ def source_frame(kind: str, image: RecordedImage, index: int) -> SourceFrame:
     try:
         return _frame_of(kind, image, index)
     except FOREIGN as error:  # JSON may have anything
-        said = shortened(" ".join(str(error).split())) or type(error).__name__
-        raise BrokenFrame(f"its message is no {kind} ({said})") from None
+        reason = shortened(" ".join(str(error).split())) or type(error).__name__
+        raise BrokenFrame(f"its message is no {kind} ({reason})") from None
 
 
 FOREIGN = (AttributeError, TypeError, ValueError, OverflowError, KeyError)

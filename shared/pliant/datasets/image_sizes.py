@@ -20,13 +20,13 @@ def most_frequent(sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
 
 
 def size_of(frame: SourceFrame) -> tuple[int, int]:
-    """(width, height) of the image as it is decoded.  Raises BrokenFrame where it does not."""
+    """(width, height) of the image as it is decoded.  Raises BrokenFrame if it does not."""
     stated = jpeg_size(frame.data) if frame.encoding == "jpeg" else None
     small = _small_shape(frame.data) if stated is not None else None
     if stated is None or small is None:
         height, width = decode(frame).shape[:2]
         return width, height
-    turned = (small[0] > small[1]) != (stated[1] > stated[0])  # as the file says
+    turned = (small[0] > small[1]) != (stated[1] > stated[0])  # as the file states
     return (stated[1], stated[0]) if turned else stated
 
 

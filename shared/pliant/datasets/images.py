@@ -110,7 +110,7 @@ def _read(index: int, image: ListedImage) -> SourceFrame:
 def image_size(images: Sequence[ListedImage]) -> tuple[int, int]:
     """(width, height) of most of the images, as some of them from all over the list tell.
 
-    Raises DatasetError where none of the first twenty, nor of these, decodes.
+    Raises DatasetError if none of the first twenty, nor of these, decodes.
     """
     count, spread = len(images), _spread(len(images))
     sizes: list[tuple[int, int]] = []
@@ -146,7 +146,7 @@ def choose_calibration(
     """The user's calibration or field of view, or else that of the source.
 
     Without any, a guess.  pixel_aspect: width over height of a pixel.
-    Raises CalibrationError where it is broken, or for other images.
+    Raises CalibrationError if it is broken, or for other images.
     """
     if spec.fov_deg is not None:
         return calibration_from_fov(*size, spec.fov_deg, pixel_aspect=pixel_aspect)

@@ -5,7 +5,7 @@ _ALONE = frozenset((0x01, *range(0xD0, 0xD8)))  # markers without a segment
 
 
 def jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """(width, height) as its header states them; None where there is none."""
+    """(width, height) as its header states them; None if there is none."""
     if data[:2] != b"\xff\xd8":
         return None
     at = 2

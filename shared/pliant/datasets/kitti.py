@@ -73,12 +73,12 @@ def open_kitti(spec: SourceSpec) -> Dataset:
             "image needs one"
         )
     listed = [ListedImage(stamp_ns=t, path=path) for t, path in zip(stamps, paths, strict=True)]
-    images, told = mended(listed, lines, file)
+    images, more_notes = mended(listed, lines, file)
     resolved = folder.resolve()
     return ImageFiles(
         name=f"kitti_{resolved.name}" if resolved.name.isdigit() else resolved.name,
         images=images,
-        notes=[*notes, *told],
+        notes=[*notes, *more_notes],
         calibration=choose_calibration(
             spec,
             image_size(images),

@@ -4,9 +4,9 @@
     a folder      with one for each frame, or for some: things that move by themselves
 
 Black is ignored and the rest is used, as in COLMAP.  In a folder a mask has the name of its image,
-with (COLMAP's way) or without the image's ending before its own: frame.jpg.png or frame.png.  Where
-images have no names of their own, or none of the masks has one of these, the last number in its
-name is that of the frame, from 0; from 1, if that is as many as there are frames.
+with (COLMAP's way) or without the image's ending before its own: frame.jpg.png or frame.png.  If
+images have no names, or no mask has the name of an image, the last number in the name of a mask is
+the frame number, from 0; from 1, if that is as many as there are frames.
 """
 
 import re
@@ -129,7 +129,7 @@ def _read(path: Path) -> BoolArray:
 
 
 def _numbered(folder: Path, files: list[Path], frames: int | None) -> dict[int, Path]:
-    """Masks by the number of their frame.  Raises DatasetError where two have the same."""
+    """Masks by the number of their frame.  Raises DatasetError if two have the same."""
     found: dict[int, Path] = {}
     for file in files:
         digits = re.findall(r"[0-9]+", file.stem)

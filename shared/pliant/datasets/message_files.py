@@ -38,7 +38,7 @@ class OpenMessages(Protocol):
     topics: list[MessageTopic]
 
     def messages(self, topic: MessageTopic) -> Iterator[RecordedImage]:
-        """The messages of one topic in order of time.  Raises DatasetError where they end badly."""
+        """The messages of one topic in order of time.  Raises DatasetError if they end badly."""
         ...
 
 
@@ -48,7 +48,7 @@ class MessageFile(Protocol):
     path: Path
 
     def open(self) -> AbstractContextManager[OpenMessages]:
-        """Open it.  Raises DatasetError where it is damaged or a library is missing."""
+        """Open it.  Raises DatasetError if it is damaged or a library is missing."""
         ...
 
 
@@ -76,7 +76,7 @@ class MessageImages:
         self.frame_count = self._topic.count if self._topic.count >= 0 else None
 
     def __iter__(self) -> Iterator[SourceFrame]:
-        """Raises DatasetError where the file is damaged or has fewer messages than it announces."""
+        """Raises DatasetError if the file is damaged or has fewer messages than it announces."""
         came = 0
         with self._file.open() as opened:
             for frame in in_order(self._frames(opened), ahead=not self.is_live):
@@ -169,7 +169,7 @@ def _with_images(listed: str) -> str:
 
 
 def _calibration(opened: OpenMessages, images: MessageTopic, where: str) -> Calibration | None:
-    """The camera that belongs to a topic of images: the topic nearest by name tells it.
+    """The camera that belongs to a topic of images: that of the topic with the most similar name.
 
     /left/image_raw has /left/camera_info; where two are equally near, nothing is guessed.
     """
@@ -203,8 +203,8 @@ def recorded_image(time_ns: int, decode: Callable[[bytes], Any], data: bytes) ->
     try:
         return RecordedImage(time_ns, decode(data))
     except Exception as error:  # of a foreign parser on foreign bytes
-        said = shortened(" ".join(str(error).split())) or type(error).__name__
-        return RecordedImage(time_ns, None, fault=f"its message is damaged ({said})")
+        reason = shortened(" ".join(str(error).split())) or type(error).__name__
+        return RecordedImage(time_ns, None, fault=f"its message is damaged ({reason})")
 
 
 def missing_library(path: Path, library: str) -> DatasetError:
@@ -214,7 +214,7 @@ def missing_library(path: Path, library: str) -> DatasetError:
 
 def damaged(path: Path, error: BaseException, hint: str) -> DatasetError:
     """One line for any error of a library about a broken file."""
-    said: Any = " ".join(str(error).split())[:120]
+    reason: Any = " ".join(str(error).split())[:120]
     return DatasetError(
-        f"{path}: is truncated or damaged ({said or type(error).__name__}); repair it with {hint}"
+        f"{path}: is truncated or damaged ({reason or type(error).__name__}); repair it with {hint}"
     )

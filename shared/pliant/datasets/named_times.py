@@ -44,7 +44,7 @@ class NamedTimes:
 
 
 def times_in_names(names: Sequence[str]) -> NamedTimes | None:
-    """The times in names without their endings; None where they tell none, or not all of them."""
+    """The times in names without their endings; None if they tell none, or not all of them."""
     dates = _dates(names)
     if dates or len(names) < 2 or len({_NUMBER.sub("#", name) for name in names}) > 1:
         return dates

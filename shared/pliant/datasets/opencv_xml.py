@@ -15,7 +15,7 @@ def is_xml(text: str) -> bool:
 
 
 def keys_of_xml(text: str) -> dict[str, Any]:
-    """The values of a file by key; raises CalibrationError where it is not OpenCV's."""
+    """The values of a file by key; raises CalibrationError if it is not OpenCV's."""
     if "<!" in text.replace("<!--", ""):  # entities expand without a limit; OpenCV writes none
         raise CalibrationError("XML with declarations: OpenCV's FileStorage has none")
     try:

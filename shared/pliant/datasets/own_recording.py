@@ -54,7 +54,7 @@ class RecordedFrames:
     ground_truth_path: Path | None = None
 
     def __init__(self, path: Path, spec: SourceSpec) -> None:
-        """Raises DatasetError where it holds no images."""
+        """Raises DatasetError if it holds no images."""
         self._recording = Recording(path)
         self._depth = spec.depth
         streams = self._recording.decoded(topics.STREAM)

@@ -182,7 +182,7 @@ class PacketDecoder:
         return self._packets.get(property_id)
 
     def set(self, property_id: int, value: float) -> bool:
-        """Go to a frame, as nearly as the rate of frames tells; nothing else can be set."""
+        """Go to a frame, as nearly as the frame rate allows; nothing else can be set."""
         rate = self._packets.get(cv2.CAP_PROP_FPS)
         if property_id != cv2.CAP_PROP_POS_FRAMES or rate <= 0.0:
             return False

@@ -46,7 +46,7 @@ class RecordedImages:
     def whole(self, image: SourceImage) -> SourceImage:
         """The image with its pixels, and without the clip.
 
-        Raises RecordingError where the clip gives other pixels, or is not there.
+        Raises RecordingError if the clip gives other pixels, or is not there.
         """
         if image.data or image.clip_frame < 0:
             return image
@@ -75,7 +75,7 @@ class _RecordedClip:
         self._begin()
 
     def pixels(self, image: SourceImage) -> bytes:
-        """The bytes of an image.  Raises RecordingError where they cannot be made again."""
+        """The bytes of an image.  Raises RecordingError if they cannot be made again."""
         ahead = image.clip_frame - self._next
         near = round(_NEAR_S * self._video.rate_hz)
         found = self._following(image) if 0 <= ahead <= near else self._sought(image, near)
@@ -92,7 +92,7 @@ class _RecordedClip:
         return found
 
     def _following(self, image: SourceImage) -> bytes | None:
-        """An image further on, by counting; None where its number has other pixels."""
+        """An image further on, by counting; None if its number has other pixels."""
         failed = 0
         while self._next < image.clip_frame and failed <= GIVE_UP:
             failed = 0 if self._video.grab() else failed + 1
@@ -100,7 +100,7 @@ class _RecordedClip:
         return self._read(image)
 
     def _sought(self, image: SourceImage, near: int) -> bytes | None:
-        """An image anywhere, near where the container has it; None where there is none like it.
+        """An image anywhere, near where the container has it; None if there is none like it.
 
         The container's list of frames may be wrong: only the checksum decides.
         """

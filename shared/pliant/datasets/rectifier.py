@@ -67,7 +67,7 @@ class Rectifier:
     def rectify(self, frame: SourceFrame) -> tuple[U8, U8 | None]:
         """Grey (H, W), and RGB (H, W, 3) where the source has colour.
 
-        Without distortion the pixels are untouched.  Raises BrokenFrame where the frame does not
+        Without distortion the pixels are untouched.  Raises BrokenFrame if the frame does not
         decode, or has another size than the calibration.
         """
         pixels = decode(frame)
@@ -84,7 +84,7 @@ class Rectifier:
         return cast(U8, cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)), pixels
 
     def mask(self, frame: SourceFrame) -> bytes:
-        """The mask of the frame's rectified image, packed; b"" where all of it is used.
+        """The mask of the frame's rectified image, packed; b"" if all of it is used.
 
         A pixel is used where all that it is made of is.  Raises BrokenFrame for a mask that does
         not decode, or has another aspect.

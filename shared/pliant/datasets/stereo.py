@@ -38,7 +38,7 @@ class StereoPair:
     scale_m: float
 
     def depth(self, left: bytes) -> bytes:
-        """The depth map as a 16-bit PNG, 0 where nothing is known; b"" where a file is no image.
+        """The depth map as a 16-bit PNG, 0 where nothing is known; b"" if a file is no image.
 
         left: an image file.
         """

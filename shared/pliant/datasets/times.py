@@ -34,7 +34,7 @@ def number_of(text: str, where: str) -> Decimal:
 
 
 def nanoseconds(value: Decimal, unit: str, where: str) -> int:
-    """A time in nanoseconds.  Raises DatasetError where it does not fit 63 bits."""
+    """A time in nanoseconds.  Raises DatasetError if it does not fit 63 bits."""
     if value > Decimal(_MAX_STAMP_NS) / UNITS[unit]:
         raise DatasetError(f"{where}: the time {str(value)[:40]} is too large to be in {unit}")
     return int((value * UNITS[unit]).to_integral_value())

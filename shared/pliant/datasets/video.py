@@ -38,7 +38,7 @@ class VideoFile:
     ground_truth_path: Path | None = None
 
     def __init__(self, file: Path, spec: SourceSpec) -> None:
-        """Raises DatasetError where it holds no video, CalibrationError for its calibration."""
+        """Raises DatasetError if it holds no video, CalibrationError for its calibration."""
         self.name = file.stem
         self.file = file
         self._version = file_version(file)
@@ -70,7 +70,7 @@ class VideoFile:
             self.notes.append(f"pixel aspect ratio {float(aspect):.3g}")
 
     def reaches(self, time_s: float) -> bool:
-        """Whether a frame is found there by seeking; where none is, only reading tells."""
+        """Whether a frame is found there by seeking; otherwise only reading shows."""
         with opened(self.file) as decoder:
             if decoder.stream is not None and decoder.stream.shown_ns:
                 return False
@@ -78,7 +78,7 @@ class VideoFile:
             return decoder.grab() and 1e-9 * decoder.stamp_ns >= time_s - 1.0 / self.rate_hz
 
     def __iter__(self) -> Iterator[SourceFrame]:
-        """Raises DatasetError where it is another file by now, or was written to meanwhile.
+        """Raises DatasetError if it is another file by now, or was written to meanwhile.
 
         A file that has lost its name while it is read is there until its end.
         """
@@ -94,7 +94,7 @@ class VideoFile:
         self.check_unwritten()
 
     def check_unwritten(self) -> None:
-        """Raise DatasetError where it was written to since it was opened."""
+        """Raise DatasetError if it was written to since it was opened."""
         now = file_version(self.file)
         if now != self._version and now[:2] == self._version[:2]:
             raise DatasetError(

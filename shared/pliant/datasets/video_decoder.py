@@ -5,6 +5,7 @@ by their timing.
 """
 
 import contextlib
+import os
 from collections.abc import Generator, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -14,10 +15,13 @@ import cv2
 
 from pliant.algorithms.arrays import U8
 from pliant.algorithms.image.fields import is_combed, one_field
+from pliant.datasets import matroska, mp4_boxes
 from pliant.datasets.packet_decoder import PacketDecoder, codec_of, decodes
-from pliant.datasets.video_streams import ChosenStream, PatchedFile, choose, streams_of
+from pliant.datasets.video_streams import ChosenStream, Container, PatchedFile, choose
 from pliant.errors import DatasetError
 
+_AVI = b"RIFF"
+"""AVI has one size for all its frames, and no times of them but their order of decoding."""
 _DEFAULT_FPS = 30.0
 _MOST_LINES = 1088
 """Maximum lines of interlaced video."""
@@ -37,6 +41,21 @@ class Capture(Protocol):
     def get(self, property_id: int, /) -> float: ...
     def set(self, property_id: int, value: float, /) -> bool: ...
     def release(self) -> None: ...
+
+
+def streams_of(file: Path) -> Container:
+    """The video streams of an MP4, MOV, Matroska or WebM file; none of any other.
+
+    Raises OSError if the file cannot be read.
+    """
+    with file.open("rb") as source:
+        size = source.seek(0, os.SEEK_END)
+        for kind in (mp4_boxes, matroska):
+            source.seek(0)
+            if kind.recognises(source.read(kind.MAGIC_BYTES)):
+                return kind.video_streams(source, size)
+        source.seek(0)
+        return Container(may_change=source.read(len(_AVI)) != _AVI)
 
 
 class VideoDecoder:
@@ -104,7 +123,7 @@ class VideoDecoder:
 
 @contextlib.contextmanager
 def opened(file: Path) -> Generator[VideoDecoder, None, None]:
-    """The decoder of the stream that is meant.  Raises DatasetError where a file has none."""
+    """The decoder of the stream that is meant.  Raises DatasetError if a file has none."""
     try:
         chosen = choose(streams_of(file))
     except OSError as error:
@@ -139,7 +158,7 @@ def quiet_opencv() -> Generator[None, None, None]:
 def _start(
     file: Path, chosen: ChosenStream, held: contextlib.ExitStack, *, raw: bool = False
 ) -> cv2.VideoCapture | None:
-    """OpenCV's reader at the first picture, or at the first packet; None where there is none.
+    """OpenCV's reader at the first picture, or at the first packet; None if there is none.
 
     A name with a colon is none of a protocol, and one that is not UTF-8 never comes to OpenCV.
     """

@@ -5,14 +5,10 @@ are hidden from it: a few bytes of the header are replaced while it reads (``Pat
 """
 
 import io
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
-
-_AVI = b"RIFF"
-"""AVI has one size for all its frames, and no times of them but their order of decoding."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +27,7 @@ class VideoStream:
     is_default: not marked as one to be passed over.
     is_still: a cover picture or thumbnails, no film.
     frames: how many it has; None if unknown to its headers.
-    stamps_ns: when frames are shown, sorted, in media time; () where only reading tells.
+    stamps_ns: when frames are shown, sorted, in media time; () if only reading shows.
     origin_ns: when the first is shown in the order of decoding, from which OpenCV counts.
     shown_ns: intervals of media time that are to be shown; () for all.
     may_change: whether the size of its images may change on the way.
@@ -69,7 +65,7 @@ class Container:
 
 @dataclass(frozen=True, kw_only=True)
 class ChosenStream:
-    """The decoded stream of a file.  stream: None where the container is not understood."""
+    """The decoded stream of a file.  stream: None if the container is not understood."""
 
     stream: VideoStream | None = None
     patches: tuple[Patch, ...] = ()
@@ -103,23 +99,6 @@ def _note(streams: Sequence[VideoStream], chosen: VideoStream) -> str:
     )
     number = next(i for i, each in enumerate(streams, start=1) if each is chosen)
     return f"{len(streams)} video streams ({listed}): reading stream {number}"
-
-
-def streams_of(file: Path) -> Container:
-    """The video streams of an MP4, MOV, Matroska or WebM file; none of any other.
-
-    Raises OSError where the file cannot be read.
-    """
-    from pliant.datasets import matroska, mp4_boxes
-
-    with file.open("rb") as source:
-        size = source.seek(0, os.SEEK_END)
-        for kind in (mp4_boxes, matroska):
-            source.seek(0)
-            if kind.recognises(source.read(kind.MAGIC_BYTES)):
-                return kind.video_streams(source, size)
-        source.seek(0)
-        return Container(may_change=source.read(len(_AVI)) != _AVI)
 
 
 class PatchedFile(io.BufferedIOBase):

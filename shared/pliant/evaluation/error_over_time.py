@@ -18,7 +18,7 @@ def error_over_time(evaluation: Evaluation) -> str:
     lines = [
         Line(part.times_s.tolist(), part.errors_m.tolist(), colours[part.kind][1]) for part in parts
     ]
-    told = "; ".join(
+    summary = "; ".join(
         f"{part.kind} ({colours[part.kind][0]}): "
         + (f"RMSE {metres(part.ate_m.rmse)}" if part.ate_m else escape(part.reason))
         for part in parts
@@ -27,10 +27,10 @@ def error_over_time(evaluation: Evaluation) -> str:
         lines,
         span=(0.0, last),
         top=max(largest, 1e-12),
-        says=("error over time", metres(largest), f"{last:.1f} s"),
+        labels=("error over time", metres(largest), f"{last:.1f} s"),
     )
     return (
         f"<h2>Comparison with ground truth</h2><figure>{drawn}<figcaption>Distance to the "
         "ground-truth position, after Sim(3) alignment of the whole trajectory: "
-        f"{told}.</figcaption></figure>"
+        f"{summary}.</figcaption></figure>"
     )

@@ -77,7 +77,7 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
         for summary in summaries:
             yield format_summary(summary)
         figures = {summary.kind: summary_to_json(summary) for summary in summaries}
-    yield from _tell_pages(request.results, evaluations)
+    yield from _report_pages(request.results, evaluations)
     if request.plot is not None:
         from pliant.evaluation.plots import plot_errors
 
@@ -168,7 +168,7 @@ def _check_outputs(request: EvaluationRequest) -> None:
         read.append(path)
 
 
-def _tell_pages(results: Sequence[Path], evaluations: Sequence[Evaluation]) -> Iterator[str]:
+def _report_pages(results: Sequence[Path], evaluations: Sequence[Evaluation]) -> Iterator[str]:
     """Draw the error over time into the pages of result folders."""
     for result, evaluation in zip(results, evaluations, strict=True):
         page = result / PAGE_NAME

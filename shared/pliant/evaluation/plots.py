@@ -12,7 +12,7 @@ _COLOURS = {"final": "#1668b8", "online": "#e0751a"}
 def plot_errors(path: Path, evaluation: Evaluation) -> None:
     """Write a PNG: distance to the true position over time, online and final.
 
-    Raises ResultError where matplotlib is not installed, or where neither trajectory could be
+    Raises ResultError if matplotlib is not installed, or where neither trajectory could be
     aligned (then there is no error to draw).
     """
     try:

@@ -26,7 +26,7 @@ class MeanAndDeviation:
 
     @staticmethod
     def of(values: Sequence[float | None]) -> "MeanAndDeviation | None":
-        """None where no run has a value."""
+        """None if no run has a value."""
         known = [value for value in values if value is not None]
         if not known:
             return None

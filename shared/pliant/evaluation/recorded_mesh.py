@@ -36,7 +36,7 @@ def mesh_against_truth(
 ) -> Iterator[str]:
     """Both meshes of a run, or of a folder of ``pliant mesh``.
 
-    Raises ResultError where there is none, or no true depth.
+    Raises ResultError if there is none, or no true depth.
     """
     if not (result / MESHES["mesh"]).exists():
         raise ResultError(f"{result}: no mesh.ply: run with a mesh, or `pliant mesh {result}`")

@@ -111,7 +111,7 @@ class TrajectoryEvaluation:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """One run: both trajectories, and how often its map had to start anew before it could.
+    """One run: both trajectories, and how often a start of its map failed before.
 
     offset_s: was added to the times of the poses.   better: a further offset with which the final
     ones fit ground truth far better.
@@ -217,7 +217,7 @@ class _Accuracy:
 def _other_segments(trajectory: Trajectory, report: RunReport, path: Path) -> list[int]:
     """Poses in each segment of report.json but the longest, which is the trajectory.
 
-    Raises ResultError where the trajectory is not the longest of them.
+    Raises ResultError if the trajectory is not the longest of them.
     """
     counts = sorted(segment.frames for segment in report.segments or () if segment.frames)
     if report.segments is not None and len(trajectory) != (counts[-1] if counts else 0):

@@ -22,9 +22,9 @@ class Segment:
 
 @dataclass(frozen=True, kw_only=True)
 class RunReport:
-    """frames: of the whole sequence.  None where the report has none.
+    """frames: of the whole sequence.  None if the report has none.
 
-    segments: in the order of time; None where the report does not list them (then the trajectory
+    segments: in the order of time; None if the report does not list them (then the trajectory
     is taken as one segment).
     """
 
@@ -56,10 +56,10 @@ def _count(data: dict[str, Any], key: str, where: str) -> int | None:
 
 
 def read_run_report(folder: Path) -> RunReport:
-    """Read ``report.json`` of a result folder; all None where there is no such file.
+    """Read ``report.json`` of a result folder; all None if there is no such file.
 
     Keys read: frames, initialisation_retries, segments [{id, first_frame, frames}].  Others are
-    left alone.  ResultError where one of them is not what it should be.
+    left alone.  ResultError if one of them is not what it should be.
     """
     path = folder / REPORT_NAME
     if not path.exists():

@@ -1,9 +1,9 @@
 """A mesh against the true surface as the field's tables have it, registered in several ways.
 
 Monocular systems are compared on 7-Scenes by accuracy (mesh to ground truth), completion (ground
-truth to mesh) and Chamfer distance (their mean), as RMSE over what lies within 0.5 m; VGGT-SLAM's
-script aligns by the trajectory's Sim(3) and then by ICP.  The other columns show what ICP hides,
-and the last one the limit of any map: the true depth itself, seen from our poses.
+truth to mesh) and Chamfer distance (their mean).  Each is the RMSE over distances below 0.5 m;
+VGGT-SLAM's script aligns by the trajectory's Sim(3) and then by ICP.  The other columns show what
+ICP hides, and the last one the limit of any map: the true depth itself, seen from our poses.
 """
 
 from dataclasses import dataclass
@@ -55,7 +55,7 @@ def surface_columns(
     samples: F64, floor: F64, true: F64, diameter_m: float
 ) -> dict[str, SurfaceFigures]:
     """Figures by column.  Samples (N, 3) of a mesh and (K, 3) of the true depth at its poses, both
-    aligned by the trajectory; (M, 3) of the true surface.  None where one of them is empty."""
+    aligned by the trajectory; (M, 3) of the true surface.  None if one of them is empty."""
     if not (len(samples) and len(floor) and len(true)):
         return {}
     still = Similarity(scale=1.0, R=np.eye(3), t=np.zeros(3))

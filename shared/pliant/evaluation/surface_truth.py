@@ -29,7 +29,7 @@ class SurfaceTruth:
     """Where material points are in every frame.  The world is that of the sequence."""
 
     def __init__(self, folder: Path, camera: PinholeCamera) -> None:
-        """Raises DatasetError where the folder is not one of a deforming built-in sequence."""
+        """Raises DatasetError if the folder is not one of a deforming built-in sequence."""
         file = folder / SURFACES_NAME
         if not file.is_file():
             raise DatasetError(

@@ -2,9 +2,9 @@
 
 Ground truth of a track is the surface point seen at the sub-pixel position of its birth, followed
 exactly by the true poses.  Births whose surface is not defined are left out: any of the four
-pixels around lies on a depth jump, within 1.5 px of one, or shows no surface.  A track that lives
-on while its surface point is hidden or out of view stays in the count, and is wrong as soon as it
-leaves the place where the point would be seen.
+pixels around lies on a depth jump, within 1.5 px of one, or shows no surface.  A track that
+continues while its surface point is occluded or out of view still counts.  It is wrong once it
+leaves the projection of the point.
 """
 
 from dataclasses import dataclass

@@ -82,15 +82,15 @@ def depth(recording: Recording, path: Path, folder: Path | None) -> None:
 
 def _seen(recording: Recording, ideal: IdealCamera, history: MapHistory) -> dict[int, SeenPoints]:
     """The points that each keyframe observes and their pixels, by its frame."""
-    told = seen_by_keyframes(recording, set(ideal.keyframes.values()))
+    seen_at = seen_by_keyframes(recording, set(ideal.keyframes.values()))
     seen: dict[int, SeenPoints] = {}
     for frame, keyframe in ideal.keyframes.items():
-        if keyframe not in told:
+        if keyframe not in seen_at:
             continue
-        rows, points = history.points_of(told[keyframe].point_ids)
+        rows, points = history.points_of(seen_at[keyframe].point_ids)
         seen[frame] = SeenPoints(
             ids=points.ids,
-            points_px=ideal.pixels(frame, told[keyframe].points_px[rows]),
+            points_px=ideal.pixels(frame, seen_at[keyframe].points_px[rows]),
             points_world=points.positions,
             sigmas=np.asarray(points.sigmas, np.float32),
             keyframes=np.asarray(points.keyframes, np.int32),

@@ -70,7 +70,7 @@ Progress = Callable[[int, int], None]
 class RecordedFrame:
     """One frame of a recording with what became of it.
 
-    image: None where it has no pixels; dark where a mask has it ignored.
+    image: None if it has no pixels; dark where a mask has it ignored.
     """
 
     image: U8 | None
@@ -146,7 +146,7 @@ def exports_in(folder: Path, *, but: Container[str] = ()) -> list[str]:
 
 
 def _check_ending(path: Path, to: str, name: str) -> None:
-    """Raise ResultError where others would take a file for another kind than it is.
+    """Raise ResultError if others would take a file for another kind than it is.
 
     name: the default.  Pictures and videos have several, and are made in the format of the ending.
     """
@@ -159,7 +159,7 @@ def _check_ending(path: Path, to: str, name: str) -> None:
 
 
 class _Followed(MetricRecording):
-    """A recording that tells how many of its images have been read: they take the time."""
+    """A recording that reports how many of its images have been read, which takes the time."""
 
     def __init__(self, path: Path, progress: Progress | None) -> None:
         super().__init__(path)

@@ -97,7 +97,7 @@ def _correction(recording: Recording) -> tuple[float, ...]:
 
 
 def camera_of(recording: Recording) -> CameraStream:
-    """The camera of a recording.  Raises ResultError where it stopped before its first frame."""
+    """The camera of a recording.  Raises ResultError if it stopped before its first frame."""
     for message in recording.decoded(topics.STREAM):
         assert isinstance(message, CameraStream)
         return message
@@ -119,7 +119,7 @@ def rectified_images(
     """Yield the images of all frames with pixels.
 
     wanted: the numbers of those that are; None: all.
-    Raises ResultError where the recording has no images.
+    Raises ResultError if the recording has no images.
     """
     rectifier = Rectifier(calibration_from_yaml(stream.calibration))
     found = False

@@ -96,7 +96,7 @@ def _surface(run: Run) -> tuple[F64, U8]:
 
 
 def _track(recording: Recording) -> tuple[EarthTrack, GpsFit]:
-    """Raises ResultError where the run has no poses, or its source no fixes that place them."""
+    """Raises ResultError if the run has no poses, or its source no fixes that place them."""
     trajectory, fit = _placed(recording, read_run(recording.path))
     latitude, longitude, altitude = _geodetic(fit, trajectory.positions)
     track = EarthTrack(

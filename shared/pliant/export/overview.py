@@ -56,7 +56,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class ShownFrame:
-    """A frame of the run.  shown: None where it is not to be seen, but its tracks continue."""
+    """A frame of the run.  shown: None if it is not to be seen, but its tracks continue."""
 
     update: MapUpdate
     tracks: FrameTracks
@@ -68,7 +68,7 @@ class Made:
     """The map of a run: its longest segment.
 
     source: name.      points: of the map.      poses: (N, 4, 4) T_world_camera.
-    mesh: None where there is none.
+    mesh: None if there is none.
     """
 
     source: str

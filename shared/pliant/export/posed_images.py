@@ -64,7 +64,7 @@ class IdealCamera:
     """
 
     def __init__(self, run: Run) -> None:
-        """Raises ResultError where there is no map."""
+        """Raises ResultError if there is no map."""
         self.segment = run.history.longest_segment()
         if run.stream is None:
             raise ResultError("the run has no map to export")
@@ -102,7 +102,7 @@ def write_posed_images(
     of all into ``masks`` beside it: black where it is ignored, white of those that have none, as
     nerfstudio takes masks of all images or of none.
 
-    mask_name: of its file, by the name of the image.    Raises ResultError where there are no
+    mask_name: of its file, by the name of the image.    Raises ResultError if there are no
     images, and where the disk fails.
     """
     make_folder(folder)

@@ -41,7 +41,7 @@ def check_deformable(recording: Recording) -> None:
 def surfels_with_images(
     recording: Recording, wanted: Callable[[Surfels], bool]
 ) -> Iterator[tuple[Surfels, U8 | None]]:
-    """The wanted frames that have surfels, with their images, None where there is none."""
+    """The wanted frames that have surfels, with their images, None if there is none."""
     has_images = next(recording.messages(topics.SOURCE), None) is not None
     images = rectified_images(recording, camera_of(recording)) if has_images else iter(())
     pixels: U8 | None = None

@@ -47,7 +47,7 @@ def textured_mesh(
     clean: without small pieces.    observed: without closed holes.    crop: only what lies in this
     box.
 
-    Raises ResultError where there is none.
+    Raises ResultError if there is none.
     """
     run = read_run(recording.path)
     segment = run.history.longest_segment()

@@ -25,13 +25,13 @@ class AnimatedMesh:
     colours: Annotated[U8, Shape("V", 3)] | None
 
 
-def write_animated_glb(path: Path, mesh: AnimatedMesh, said: dict[str, Any]) -> None:
+def write_animated_glb(path: Path, mesh: AnimatedMesh, extras: dict[str, Any]) -> None:
     """The first key frame as the rest shape, and displacements from it as morph targets.
 
-    At key frame k the weight of its own target is 1 and of all others 0, with linear interpolation
-    between, so the vertices move on straight lines from key frame to key frame.  Positions are
-    exact there but for the rounding of float32.    said: what readers show of the object.
-    Raises ResultError.
+    At key frame k its own target has the weight 1 and all others 0, with linear interpolation
+    between.  So vertices move on straight lines from key frame to key frame.  Positions are exact
+    there but for the rounding of float32. said: what readers show of the object.  Raises
+    ResultError.
     """
     glb = Glb()
     rest, *moved = mesh.positions
@@ -62,7 +62,7 @@ def write_animated_glb(path: Path, mesh: AnimatedMesh, said: dict[str, Any]) -> 
         },
         material={},
         animations=[{"samplers": [sampler], "channels": [channel]}],
-        extras=said,
+        extras=extras,
     )
 
 

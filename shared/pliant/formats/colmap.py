@@ -39,7 +39,7 @@ def write_colmap(
     """Write a model: images are numbered from 1 in their order, points from 1 by row.
 
     positions: (N, 3) in the world.     colours: (N, 3) RGB.
-    Raises ResultError where the disk fails.
+    Raises ResultError if the disk fails.
     """
     write_lines(
         folder / "cameras.txt",

@@ -39,7 +39,9 @@ def write_las(
     laspy or pyproj is missing.
     """
     laspy, pyproj = load_las()
-    system = pyproj.CRS.from_epsg(utm_epsg(np.mean(latitude_deg), np.mean(longitude_deg)))
+    system = pyproj.CRS.from_epsg(
+        utm_epsg(float(np.mean(latitude_deg)), float(np.mean(longitude_deg)))
+    )
     to_utm = pyproj.Transformer.from_crs(4326, system, always_xy=True)
     east, north = to_utm.transform(longitude_deg, latitude_deg)
     header = laspy.LasHeader(version="1.4", point_format=_POINT_FORMAT)

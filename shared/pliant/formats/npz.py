@@ -18,7 +18,7 @@ class NpzWriter:
     """``with NpzWriter(path) as npz: npz.add("ids", rows)``; equal rows give equal bytes.
 
     Every array added under a name must have the same dtype and, but for its first side, shape.
-    The file appears when all is well at the end.  Raises ResultError where it cannot be written.
+    The file appears when all is well at the end.  Raises ResultError if it cannot be written.
     """
 
     def __init__(self, path: Path) -> None:

@@ -59,7 +59,7 @@ def write_ply(
     """Write (N, 3) points; equal arrays give equal bytes.  See PlyData for the shapes.
 
     Raises ValueError on wrong shapes, values that are not finite or corners that do not exist,
-    ResultError where the file cannot be written.
+    ResultError if the file cannot be written.
     """
     fields: list[tuple[str, str]] = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
     if normals is not None:

@@ -44,7 +44,7 @@ def shorten(text: str) -> str:
 def parse_seconds(text: str) -> int:
     """Decimal seconds to integer nanoseconds, exactly (rounded beyond the ninth digit).
 
-    Raises ValueError where the text is not a finite number or does not fit 64 bits.
+    Raises ValueError if the text is not a finite number or does not fit 64 bits.
     """
     try:
         value = Decimal(text)

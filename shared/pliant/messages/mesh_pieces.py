@@ -41,7 +41,7 @@ def split(
 
 
 def joined(pieces: Sequence[MeshPiece]) -> TriangleMesh:
-    """The mesh of all its pieces, in order.  Raises MessageError where they are not all there."""
+    """The mesh of all its pieces, in order.  Raises MessageError if they are not all there."""
     wanted = pieces[0].pieces if pieces else 1
     if [p.piece for p in pieces] != list(range(wanted)):
         raise MessageError(f"a mesh has {wanted} pieces, {len(pieces)} came")

@@ -24,7 +24,7 @@ _WORTH = 0.95  # share that must remain at most: what is compressed already stay
 
 
 def pack(pixels: U8, rows: int) -> msgpack.ExtType | None:
-    """Pixels (n,) of that many rows, compressed; None where that gains nothing."""
+    """Pixels (n,) of that many rows, compressed; None if that gains nothing."""
     size = pixels.size
     if size < _LEAST_BYTES:
         return None

@@ -62,10 +62,10 @@ IMAGE = Topic(
 )
 # Empty if only the recorder would read it.
 DEPTH = Topic("camera/depth", Depth, per_frame=True, max_bytes=128 * _MIB, compression="")
-# All that the source's other sensors measured, before the first frame: nothing where it has none.
+# All that the source's other sensors measured, before the first frame: nothing if it has none.
 IMU = Topic("imu/samples", ImuPiece, per_frame=False, max_bytes=_MIB, kept_whole=True)
 GPS = Topic("gps/fixes", GpsPiece, per_frame=False, max_bytes=_MIB)
-# The map of earlier sessions, before the first frame: nothing where a run begins without one.
+# The map of earlier sessions, before the first frame: nothing if a run begins without one.
 MAP_KNOWN = Topic("map/known", MapKeyframe, per_frame=False, max_bytes=64 * _MIB, kept_whole=True)
 EXTREMA = Topic("tracks/extrema", Extrema, per_frame=True, viewed=2)
 # Updates are deltas: what a viewer has lost it waits for until the next snapshot.

@@ -1,7 +1,7 @@
 """Every message.  Each is a frozen record; fields are added with a default, never renamed.
 
-A message that carries the result of an algorithm *is* that result plus a header, so a service
-sends what it computed and an algorithm takes what arrived, without copying fields about.
+A message with the result of an algorithm *is* that result plus a header.  So a service sends the
+result, and an algorithm takes a message, without copying fields.
 """
 
 from dataclasses import dataclass, field, fields

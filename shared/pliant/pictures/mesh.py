@@ -49,8 +49,8 @@ class MeshPictures:
 def mesh_view(mesh: TriangleMesh, T_world_camera: F64) -> MapView:
     """The view from above that shows most of a mesh, seen from a path (N, 4, 4).
 
-    Of some directions it is the one with the largest product of the share of the surface that is
-    seen and the share of the picture that it fills.
+    Of several directions it is the one with the largest product of two shares: of the surface that
+    is visible, and of the picture that it fills.
     """
     if not len(mesh.triangles):
         return choose_view(mesh.positions.astype(np.float64), T_world_camera)

@@ -25,7 +25,7 @@ _ANIMATIONS = (".webp", ".gif", ".avif")
 
 
 def write_image(path: Path, picture: U8) -> None:
-    """Write (H, W, 3) RGB in the format of the suffix.  ResultError where that is unknown."""
+    """Write (H, W, 3) RGB in the format of the suffix.  ResultError if that is unknown."""
     try:
         options = [cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY] if path.suffix == ".webp" else []
         good, data = cv2.imencode(path.suffix, np.ascontiguousarray(picture[:, :, ::-1]), options)

@@ -36,7 +36,7 @@ class Index:
     """The chunks of a recording in order, and its topics."""
 
     def __init__(self, path: Path) -> None:
-        """Raises RecordingError where there is no recording, or a part of it was not closed."""
+        """Raises RecordingError if there is no recording, or a part of it was not closed."""
         files = parts_of(path)
         if not files:
             raise RecordingError(f"{path}: no such recording")
@@ -149,7 +149,7 @@ class Index:
 
 
 def _summary(stream: BinaryIO, size: int) -> bytes | None:
-    """The summary section; None where the file has none."""
+    """The summary section; None if the file has none."""
     tail_size = FOOTER.size + len(MAGIC)
     if size < tail_size:
         return None

@@ -65,8 +65,8 @@ def _compare_topic(
         if a is None or b is None or a.data == b.data:
             continue
         was, now = a.decode(), b.decode()
-        told = first_difference(was, now, tolerances)
-        if not told:
+        text = first_difference(was, now, tolerances)
+        if not text:
             continue
         differing += 1
         if order or content:
@@ -74,7 +74,7 @@ def _compare_topic(
         if was.frame != now.frame:
             order.append(f"message {counts[0] - 1} is of frame {now.frame}, was of {was.frame}")
         else:
-            content.append(f"frame {was.frame}: {told}")
+            content.append(f"frame {was.frame}: {text}")
     if counts[0] != counts[1]:
         what = f"{counted(counts[1], 'message')}, was {counts[0]}"
         yield Difference(topic.key, "count", what, abs(counts[0] - counts[1]))
@@ -91,13 +91,13 @@ def first_difference(
     for field in fields(was):
         a, b = getattr(was, field.name), getattr(now, field.name)
         if isinstance(a, np.ndarray):
-            told = _arrays(a, b, allowed.get(field.name, 0.0))
+            text = _arrays(a, b, allowed.get(field.name, 0.0))
         elif field.name in allowed and _near(a, b, allowed[field.name]):
-            told = ""
+            text = ""
         else:
-            told = "" if a == b else f"{_short(b)}, was {_short(a)}"
-        if told:
-            return f"{field.name}: {told}"
+            text = "" if a == b else f"{_short(b)}, was {_short(a)}"
+        if text:
+            return f"{field.name}: {text}"
     return ""
 
 
@@ -123,11 +123,11 @@ def _arrays(was: Any, now: Any, tolerance: float) -> str:
         return "the bits of a zero or a NaN"
     at = tuple(int(i) for i in places[0])
     where = "[" + ", ".join(map(str, at)) + "]"
-    told = f"{where} {now[at]!s}, was {was[at]!s}; {len(places)} of {was.size} values differ"
+    text = f"{where} {now[at]!s}, was {was[at]!s}; {len(places)} of {was.size} values differ"
     if was.dtype.kind == "f":
         largest = float(np.nanmax(np.abs(now.astype(np.float64) - was.astype(np.float64))))
-        told += f", by {largest:.3g} at most"
-    return told
+        text += f", by {largest:.3g} at most"
+    return text
 
 
 def _short(value: Any) -> str:

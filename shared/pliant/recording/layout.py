@@ -63,7 +63,7 @@ class Inflated:
     """The intact content of compressed bytes.  Memory: a block, and the requested bytes."""
 
     def __init__(self, stored: Source, limit: int) -> None:
-        """``limit``: nothing is inflated beyond what the chunk says that it holds."""
+        """``limit``: nothing is inflated beyond the size that the chunk states."""
         self._blocks = _zstd_blocks(stored)
         self._left = limit
         self._block = BytesIO()

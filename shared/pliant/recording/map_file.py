@@ -45,7 +45,7 @@ class MapFile:
     """A kept map on disk."""
 
     def __init__(self, path: Path) -> None:
-        """``path``: the file, or a result folder.  Raises MapError where it is no map, or one of a
+        """``path``: the file, or a result folder.  Raises MapError if it is no map, or one of a
         newer version."""
         self.path = path / MAP_NAME if path.is_dir() else path
         if not self.path.is_file():

@@ -72,7 +72,7 @@ class RollingWriter:
     ) -> None:
         """``roll_bytes``, ``roll_ns``: size and span of a part, 0 for no limit; without either,
         one file.  append: begin a part behind those that are there, as a recorder does that may
-        be started again.  Raises RecordingError where nothing can be written."""
+        be started again.  Raises RecordingError if nothing can be written."""
         self._path = path
         self._metadata = metadata
         self._roll_bytes = roll_bytes

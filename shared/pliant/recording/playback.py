@@ -18,7 +18,7 @@ class Playback:
     """Messages by their place in time: seconds of capture time since the first frame."""
 
     def __init__(self, path: Path) -> None:
-        """Raises RecordingError where there is no recording that was closed, with frames in it."""
+        """Raises RecordingError if there is no recording that was closed, with frames in it."""
         self.path = path
         self._index = Index(path)
         framed = [topic for topic in self._index.topics if topic.per_frame]

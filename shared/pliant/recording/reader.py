@@ -12,6 +12,7 @@ from pliant.messages.topics import MAP_FINAL, Topic, by_key
 from pliant.messages.types import Header
 from pliant.recording.parts import parts_of
 from pliant.recording.scan import Closed, Damage, Item, StoredMessage, scan
+from pliant.recording.writer import RecordingWriter
 
 
 @dataclass(frozen=True)
@@ -24,11 +25,18 @@ class Recorded:
     data: bytes
     publish_time_ns: int = 0
     checked: bool = True
-    """False where it comes from a chunk that was cut off, so that no checksum vouches for it."""
+    """False if it comes from a chunk that was cut off, so that no checksum vouches for it."""
 
     def decode(self) -> Header:
-        """The message.  Raises MessageError where its bytes are not what its topic carries."""
+        """The message.  Raises MessageError if its bytes are not what its topic carries."""
         return codec.decode(self.topic.message, self.data, max_bytes=self.topic.max_bytes)
+
+    def write_to(self, writer: RecordingWriter) -> None:
+        """Append the message to another recording, with its number and times."""
+        writer.write(
+            self.topic, self.data, sequence=self.sequence, log_time_ns=self.log_time_ns,
+            publish_time_ns=self.publish_time_ns,
+        )  # fmt: skip
 
 
 class Recording:
@@ -37,7 +45,7 @@ class Recording:
     def __init__(self, path: Path) -> None:
         """``path``: a file, or the name or folder of one in parts.
 
-        Raises RecordingError where there is no such file.
+        Raises RecordingError if there is no such file.
         """
         self.files = parts_of(path)
         """The files that it consists of, in order."""

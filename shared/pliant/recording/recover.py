@@ -23,7 +23,7 @@ from pliant.recording.summary import summarise
 from pliant.recording.writer import RecordingWriter
 
 RECOVERED = "recovered"
-"""Name of the metadata record that says what a recovered recording was made of."""
+"""Name of the metadata record that names the source of a recovered recording."""
 
 
 @dataclass
@@ -49,8 +49,8 @@ def decodes(message: Recorded) -> bool:
 def recover(damaged: Path, output: Path, *, keep: Callable[[Recorded], bool] = decodes) -> Recovery:
     """Copy everything that is intact into a new recording, which appears whole or not at all.
 
-    Chunks count by their checksums, and of them the messages that ``keep`` says.  Raises
-    RecordingError where nothing can be read or written.
+    Chunks count by their checksums, and in them the messages that ``keep`` selects.  Raises
+    RecordingError if nothing can be read or written.
     """
     partial = output.with_name(output.name + ".partial")
     recovery = Recovery()
@@ -88,13 +88,7 @@ def recover(damaged: Path, output: Path, *, keep: Callable[[Recorded], bool] = d
 
 
 def _keep(writer: RecordingWriter, message: Recorded, recovery: Recovery) -> None:
-    writer.write(
-        message.topic,
-        message.data,
-        sequence=message.sequence,
-        log_time_ns=message.log_time_ns,
-        publish_time_ns=message.publish_time_ns,
-    )
+    message.write_to(writer)
     if message.topic is not topics.STREAM_END:
         recovery.messages += 1
         recovery.unchecked += not message.checked
@@ -201,7 +195,7 @@ class _Books:
             self._count_last(Index(file))
 
     def take_up_last(self, file: Path) -> None:
-        """Count what a part says that was perhaps cut off."""
+        """Count the messages of a part that may have been cut off."""
         summary = summarise(file)
         if not summary.has_index or summary.damage:
             self.mend(file)

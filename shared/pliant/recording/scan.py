@@ -2,8 +2,8 @@
 
 Everything in the file is checked before use: sizes against the file's own, chunks by their
 checksum.  Memory holds a chunk of the usual size, compressed and not, or one message of a larger
-one, whatever a length field says.  After damage the walk continues with the next chunk whose header
-and checksum hold.
+one, whatever a length field states.  After damage the scan continues with the next chunk whose
+header and checksum are valid.
 """
 
 import re
@@ -101,7 +101,7 @@ def scan(path: Path, size_limit: Callable[[str], int]) -> Iterator[Item]:
     """Everything in the file that is intact, in order.
 
     ``size_limit`` says for a topic's name how large a message may be; where it says 0, messages are
-    passed over unread, and chunks that an intact index says to hold nothing else are not even
+    passed over unread, and chunks that hold nothing else by an intact index are not even
     looked at.  Raises RecordingError for a file that is none or cannot be read.
     """
     try:
@@ -148,7 +148,7 @@ class _Walk:
         """One chunk alone."""
         chunk = self._chunk_at(at)
         if chunk is None:
-            yield Damage(at, 0, "no chunk where the index says")
+            yield Damage(at, 0, "no chunk where the index has one")
         else:
             yield from self._chunk(chunk)
 
@@ -360,7 +360,7 @@ class _Walk:
             return None
         _, _, start, length, size = CHUNK_INDEX.unpack_from(index)
         places = index[CHUNK_INDEX.size : CHUNK_INDEX.size + size]
-        if not size or len(places) < size or size % CHUNK_PLACE.size:  # says not what it holds
+        if not size or len(places) < size or size % CHUNK_PLACE.size:  # of a wrong size
             return None
         if any(self._limits.get(n, 1) for n, _ in CHUNK_PLACE.iter_unpack(places)):
             return None
@@ -387,7 +387,7 @@ def _parsed(read: Callable[[ReadDataStream], _R], content: bytes) -> _R | None:
 
 
 def _passed(records: Source, size: int) -> bool:
-    """Skip that many bytes; False where there are fewer."""
+    """Skip that many bytes; False if there are fewer."""
     while size > 0:
         block = records.read(min(size, BLOCK_BYTES))
         if not block:

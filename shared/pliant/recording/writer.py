@@ -45,7 +45,7 @@ class RecordingWriter:
     ) -> None:
         """Create the file.  ``metadata`` is written first: the resolved config, versions, host.
 
-        replace: an earlier file of this name.  Raises RecordingError where the file cannot be
+        replace: an earlier file of this name.  Raises RecordingError if the file cannot be
         created.
         """
         self._path = path
@@ -177,7 +177,7 @@ class RecordingWriter:
         try:
             self.close()
         except RecordingError:
-            if error_type is None:  # else the first error tells more than this one
+            if error_type is None:  # otherwise the first error is more helpful
                 raise
 
     def _close_chunks(self) -> None:

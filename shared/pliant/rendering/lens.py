@@ -32,7 +32,7 @@ def pixel_rays(
 ) -> F64:
     """(H, W, 2) rays of all pixels, taken at ``offset_px`` from the pixels' centres.
 
-    Raises ValueError where the model cannot be inverted (a distortion that folds the image).
+    Raises ValueError if the model cannot be inverted (a distortion that folds the image).
     """
     u = (np.arange(camera.width) + offset_px[0] - camera.cx) / camera.fx
     v = (np.arange(camera.height) + offset_px[1] - camera.cy) / camera.fy

@@ -17,11 +17,11 @@ def by_sensors(recording: Recording, run: Run) -> Scale | None:
     """
     samples, fixes, found = imu_of(recording), fixes_of(recording), None
     if len(samples.stamps_ns):
-        told = by_samples(run.history, samples)
-        if isinstance(told, Scale):
-            found = told
+        result = by_samples(run.history, samples)
+        if isinstance(result, Scale):
+            found = result
         else:
-            run.inertial_refusal = told
+            run.inertial_refusal = result
     longest = run.history.longest_segment()
     if not len(fixes.stamps_ns) or longest < 0:
         return found

@@ -29,41 +29,43 @@ _KNOWN = 0.05
 """Standard deviation of the log focal length above which it counts as unknown."""
 
 _MODEL = 0.007
-"""Standard deviation of the log focal length by errors that leave no residual: those of all tracks
-alike, and of the lens model.  `scripts/bench coverage`."""
+"""Standard deviation of the log focal length by errors that leave no residual: common to all
+tracks, or of the lens model.  `scripts/bench coverage`."""
 
 _CONTRADICTED = 2.0
-"""Standard deviations of the calibration's prior from which on the images contradict it."""
+"""Standard deviations of the calibration's prior above which the images contradict it."""
 
 _BENDS = 0.1
-"""Correction of the log focal length from which on a map may stay bent though the lens is found: it
-began with the wrong one (two standard deviations of what draws adjustments that refute theirs)."""
+"""Correction of the log focal length above which a map may stay bent, because it started with the
+wrong one (two standard deviations of the corrections that contradict the given one)."""
 
 _SURE = 3.0
-"""Minimum difference between the two, in standard deviations of the estimate."""
+"""Minimum difference between the given and the estimated focal length, in standard deviations of
+the estimate."""
 
 _OFF_CENTRE = 0.03
-"""Error of the principal point, as a share of the focal length, from which on the images contradict
+"""Error of the principal point, as a share of the focal length, above which the images contradict
 the calibration."""
 
 _FAR_OFF_CENTRE = 0.05
 """As ``_BENDS`` of the principal point: online poses are wrong until it is found."""
 
 _NOT_SQUARE, _FAR_FROM_SQUARE = 0.01, 0.03
-"""As these two of the logarithm of the aspect ratio."""
+"""As the two above, of the logarithm of the aspect ratio."""
 
 _FORWARD = math.cos(math.radians(15.0))
 _TURN_DEG = 20.0
-"""Motion that leaves the focal length open: along the axis, or turning by less than this."""
+"""Motion that leaves the focal length uncertain: along the axis, or with less rotation than
+this."""
 
 
 def found_calibration(run: Run) -> Calibration | None:
-    """The source's calibration, at the size of its images, corrected as its last segment is.
+    """The calibration of the source, at the size of its images, with the correction of the last
+    segment; None without a stream.
 
-    Its ``focal_sigma`` says what is still open: a map that was made with a wrong one is bent, and
-    so its estimate is as far off as the two differ.  Where the focal length changes during
-    the clip it is the middle of the range, and uncertain by half of it.
-    None where there is no stream.
+    ``focal_sigma`` includes the difference between the given and the estimated focal length: a
+    map that started with a wrong one is bent.  If the focal length changes during the clip, the
+    calibration has the middle of its range, and half of the range as uncertainty.
     """
     if run.stream is None or not run.stream.calibration:
         return None
@@ -86,20 +88,20 @@ def found_calibration(run: Run) -> Calibration | None:
 
 
 def focal_sigma(run: Run) -> float:
-    """Standard deviation of the log focal length that was found; 0 where none was."""
+    """Standard deviation of the estimated log focal length; 0 without an estimate."""
     formal = run.calibration_sigmas[0] if run.calibration_sigmas else 0.0
     return with_model_error(formal) if formal > 0.0 else 0.0
 
 
 def with_model_error(formal: float) -> float:
-    """Standard deviation of a log focal length, from that of an adjustment."""
+    """Add the model error to the standard deviation of a log focal length by an adjustment."""
     return math.hypot(formal, _MODEL)
 
 
 def _corrected(
     given: Calibration, camera: PinholeCamera, correction: tuple[float, ...]
 ) -> Calibration:
-    """camera: the rectified one, of which the correction speaks.
+    """camera: the rectified one, to which the correction applies.
 
     Only the focal length, if no lens of the source's model is near the estimate.
     """
@@ -119,7 +121,8 @@ def _corrected(
 def _fitted(
     start: Calibration, given: Calibration, camera: PinholeCamera, correction: tuple[float, ...]
 ) -> Calibration:
-    """Least squares of focal lengths and coefficients: the product of two lenses is none."""
+    """Fit focal lengths and coefficients by least squares: two lenses in sequence are no lens of
+    the model."""
     u, v = np.meshgrid(
         np.linspace(0.0, camera.width - 1.0, _GRID), np.linspace(0.0, camera.height - 1.0, _GRID)
     )
@@ -145,7 +148,7 @@ def _fitted(
 
 
 def calibration_verdict(run: Run, final: dict[int, Any]) -> str:
-    """One line for the user on the calibration; "" where the given one was confirmed."""
+    """One line for the user on the calibration; "" if the given one was confirmed."""
     correction, sigmas = run.calibration_correction, run.calibration_sigmas
     if run.stream is None or len(correction) < 3 or len(sigmas) < 3:
         return ""
@@ -175,7 +178,7 @@ def calibration_verdict(run: Run, final: dict[int, Any]) -> str:
 
 
 def focal_changes(run: Run) -> str:
-    """How the focal length changes during the clip; "" where it does not."""
+    """How the focal length changes during the clip; "" if it does not."""
     if run.stream is None or run.focal_range is None or not run.calibration_correction:
         return ""
     focal = run.stream.camera.fx * math.exp(run.calibration_correction[0])
@@ -188,8 +191,8 @@ def focal_changes(run: Run) -> str:
 
 
 def calibration_doubt(run: Run, final: dict[int, Any]) -> str:
-    """As ``calibration_verdict`` where the map is bent by what is not known of the camera, as far
-    as the run can tell; else ""."""
+    """As ``calibration_verdict`` if the uncertainty of the camera bends the map, as far as the run
+    knows; otherwise ""."""
     correction, sigmas = run.calibration_correction, run.calibration_sigmas
     if run.stream is None or len(correction) < 3 or len(sigmas) < 3:
         return ""
@@ -201,7 +204,7 @@ def calibration_doubt(run: Run, final: dict[int, Any]) -> str:
 
 
 def _is_contradicted(run: Run) -> bool:
-    """Whether the images do not agree with a calibration that was no guess."""
+    """Whether the images contradict a calibration that was not a guess."""
     correction, sigmas = run.calibration_correction, run.calibration_sigmas
     if run.stream is None or run.stream.focal_sigma > 0.0 or len(sigmas) < 2:
         return False
@@ -220,7 +223,7 @@ def _off_centre(correction: tuple[float, ...]) -> float:
 
 
 def _corner_px(camera: PinholeCamera, correction: tuple[float, ...]) -> float:
-    """How far a point moves that the given camera sees in its farthest corner."""
+    """How far, in px, a point moves that the given camera sees in its farthest corner."""
     corners = np.array(
         [(u, v) for u in (0.0, camera.width - 1.0) for v in (0.0, camera.height - 1.0)], np.float32
     )
@@ -232,7 +235,7 @@ def _corner_px(camera: PinholeCamera, correction: tuple[float, ...]) -> float:
 
 
 def _why(final: dict[int, Any]) -> str:
-    """Why the motion of the frames leaves the focal length open, in words."""
+    """Why the motion of the frames leaves the focal length uncertain, in words."""
     poses = [pose_to_matrix(pose) for _, (_, pose) in sorted(final.items())]
     if len(poses) < 2:
         return ""

@@ -1,9 +1,9 @@
-"""An earlier result stays within its folder until the one that replaces it has its first frame.
+"""An earlier result stays in its folder until the result that replaces it has a frame.
 
 The names of folders show its progress, so that it may be interrupted at any point, by a kill or a
 power cut, without loss: ``earlier_result.half`` while entries move, either way;
 ``earlier_result.pliant`` once all are aside: what lies beside it is new, and this is a result that
-can be looked at; ``.pliant-replaced-*`` once it is not wanted any more.
+can be opened; ``.pliant-replaced-*`` once it has been replaced.
 """
 
 import os
@@ -35,12 +35,12 @@ def is_aside(output: Path) -> bool:
 
 
 def is_moving(output: Path) -> bool:
-    """Whether something came between while a result was set aside or put back."""
+    """Whether moving a result aside or back was interrupted."""
     return (output / _HALF).is_dir()
 
 
 def replace(output: Path) -> None:
-    """Let go of what is set aside: another result has begun.  Raises OSError."""
+    """Mark what is set aside as replaced: another result has begun.  Raises OSError."""
     # Into a folder of its own: one that could not be emptied may be there still.
     (output / _WHOLE).rename(Path(tempfile.mkdtemp(prefix=_REPLACED, dir=output)) / _WHOLE)
     sync(output)
@@ -48,7 +48,7 @@ def replace(output: Path) -> None:
 
 
 def clear(output: Path) -> None:
-    """Delete what has been replaced, as far as it can be, and folders that nothing is in."""
+    """Delete what has been replaced, as far as possible, and empty folders."""
     for name in (_HALF, _WHOLE):
         with suppress(OSError):
             (output / name).rmdir()
@@ -59,7 +59,7 @@ def clear(output: Path) -> None:
 def put_back(output: Path, new: Iterable[Path]) -> None:
     """Put what is set aside where it was.  Raises OSError.
 
-    new: what lies beside it, and goes.
+    new: the entries beside it, which are deleted.
     """
     remove(output, new)
     (output / _WHOLE).rename(output / _HALF)
@@ -91,7 +91,7 @@ def remove(output: Path, entries: Iterable[Path]) -> None:
 
 
 def _clear_folders(entries: Iterable[Path], output: Path) -> None:
-    """Folders within the result's that these were in go, but for those with something else."""
+    """Delete the folders inside the result's that have become empty."""
     for folder in {entry.parent for entry in entries} - {output}:
         with suppress(OSError):
             folder.rmdir()

@@ -14,10 +14,11 @@ from pliant.trajectory import Trajectory
 def place_on_earth(
     recording: Recording, run: Run, trajectory: Trajectory, *, oriented: bool = True
 ) -> GpsFit:
-    """The similarity from the world of a trajectory to the Earth.   oriented: else its scale alone.
+    """Return the similarity from the world of a trajectory to the Earth.   oriented: otherwise only
+    its scale.
 
     run: of the trajectory; where it is level, its z is up.
-    Raises ResultError where the fixes do not determine it, or there are none.
+    Raises ResultError if the fixes do not determine it, or there are none.
     """
     fixes = fixes_of(recording)
     if not len(fixes.stamps_ns):

@@ -32,9 +32,9 @@ CONFIG_NAME = "config.yaml"
 REPORT_NAME = "report.json"
 PAGE_NAME = "report.html"
 STATE_FOLDER = "state"
-"""Checkpoints of the services, during a run that may be restarted."""
+"""Folder of the services' checkpoints, during a run that may be restarted."""
 SESSION_NAME = "session.json"
-"""During a run: how to reach it."""
+"""File with the endpoint and session, during a run."""
 CALIBRATION_NAME = "calibration.yaml"
 TRAJECTORY_NAME = "trajectory.txt"
 SURFELS_NAME = "surfels.npz"
@@ -56,11 +56,11 @@ SOMETIMES = (MAP_NAME, SCALE_NAME, MESH_ERROR_NAME, DEFORMING_MAP_NAME)
 deforms."""
 MESH_FILES = ("mesh.ply", "mesh_coarse.ply", "mesh.png", "mesh_shaded.png", "mesh_normals.png")
 _SWITCHING = ".results-whole"
-"""Results that are whole, and on their way to their places."""
+"""Complete results that are about to be moved into place."""
 _LOGS, _METADATA = "logs", "metadata.json"
 _OF_SEGMENT = re.compile(r"_segment_\d+(?=\.\w+$)")
 _OF_FRAMES = (topics.SOURCE, topics.EXTREMA, topics.SURFELS)
-"""One of these has each frame, whatever the profile, and whether images are recorded or not."""
+"""Every frame is in one of these, whatever the profile, even if images are not recorded."""
 _VERSIONS = ("eclipse-zenoh", "mcap", "msgpack", "numba", "numpy", "opencv-python-headless")
 
 
@@ -75,8 +75,8 @@ def folder_name(source: str) -> str:
 def keep_apart(output: Path, read: Iterable[Path], *, option: str = "--output") -> None:
     """Raise ResultError if an output would overwrite an input of the command.
 
-    read: files and folders, which may not be the output nor lie in it, by what the paths resolve
-    to: links and ``..`` are seen through.  option: that names the output.
+    read: files and folders that may neither be the output nor lie in it, after links and ``..`` are
+    resolved.  option: the one that names the output.
     """
     where = output.resolve()
     for path in read:
@@ -88,14 +88,14 @@ def keep_apart(output: Path, read: Iterable[Path], *, option: str = "--output") 
 
 
 def files_read(result: Path) -> list[Path]:
-    """The files that a command may read of a result folder or a recording, or will write to one."""
+    """The files that a command may read from a result folder or a recording, or writes to one."""
     names = (RECORDING_NAME, CONFIG_NAME, *_RIGID_FILES, *SOMETIMES, *MESH_FILES, SURFELS_NAME)
     return [*parts.parts_of(result), *(result / name for name in names)]
 
 
 @contextmanager
 def all_or_none(output: Path) -> Generator[Path]:
-    """A folder whose files all go into ``output`` at its end, or none where the disk is full.
+    """A folder whose files all move into ``output`` at its end, or none if the disk is full.
 
     Raises ResultError.
     """
@@ -112,8 +112,8 @@ def all_or_none(output: Path) -> Generator[Path]:
 
 
 def _switch(made: Path, output: Path) -> None:
-    """Put files in place, from one moment on all of them: who is killed in between has it done by
-    the next one who takes the folder.  Raises OSError."""
+    """Put all files in place atomically: after a kill, the next holder of the folder completes it.
+    Raises OSError."""
     for path in made.iterdir():
         if is_folder(output / path.name):
             raise IsADirectoryError(errno.EISDIR, f"{path.name} is a folder")
@@ -150,9 +150,9 @@ def _finish_switch(output: Path) -> None:
 
 @contextmanager
 def written(output: Path, *, force: bool) -> Generator[Held]:
-    """Hold a result folder while results are written to it; made here, it goes if it stays empty.
+    """Hold a result folder while results are written to it; a new one is deleted if it stays empty.
 
-    Raises ResultError where the results cannot go there, or another process is writing them.
+    Raises ResultError if the results cannot go there, or another process is writing them.
     """
     check_output(output, force=force)
     missing = [folder for folder in (output, *output.parents) if not folder.exists()]
@@ -184,7 +184,7 @@ def written(output: Path, *, force: bool) -> Generator[Held]:
 def recorded_into(folder: Path) -> Generator[None]:
     """Hold the folder of a recording against those who would replace what is there.
 
-    Others may record into it beside us.  Raises ResultError where results are written to it.
+    Others may record into it beside us.  Raises ResultError if results are written to it.
     """
     settle_killed(folder)
     try:
@@ -204,7 +204,7 @@ def is_being_written(output: Path) -> bool:
 
 
 def check_free(*folders: Path, elsewhere: bool = True) -> None:
-    """Raise ResultError where another process writes to one of these folders.
+    """Raise ResultError if another process writes to one of these folders.
 
     elsewhere: whether the command has an --output that can name another one.
     """
@@ -217,7 +217,7 @@ def check_free(*folders: Path, elsewhere: bool = True) -> None:
 
 
 def check_output(output: Path, *, force: bool) -> None:
-    """Raise ResultError where the results cannot go there.  Changes nothing."""
+    """Raise ResultError if the results cannot go there.  Changes nothing."""
     try:
         if output.exists() and not output.is_dir():
             raise ResultError(f"{output} is a file: choose another --output")
@@ -238,8 +238,8 @@ def check_output(output: Path, *, force: bool) -> None:
 def prepare(output: Path, config: str) -> None:
     """Make the folder, with what the services read.
 
-    An earlier result is set aside until the new one has frames; `written` puts it back where there
-    are none in the end.  Raises ResultError.
+    An earlier result is set aside until the new one has frames; `written` puts it back if there are
+    none in the end.  Raises ResultError.
     """
     folder = parts.folder_of_parts(output / RECORDING_NAME)
     if folder.is_symlink() and parts.parts_in(folder):
@@ -259,7 +259,7 @@ def prepare(output: Path, config: str) -> None:
 
 
 def settle_killed(output: Path) -> None:
-    """Settle which result a folder keeps, where who was to replace it was killed.
+    """Decide which result a folder keeps after the process that was to replace it was killed.
 
     Raises PliantError.
     """
@@ -282,10 +282,11 @@ def let_go(output: Path) -> None:
 
 
 def _settle(output: Path) -> None:
-    """Where an earlier result is set aside: let it go if the new one has frames, else put it back.
+    """If an earlier result is set aside: delete it if the new one has frames, otherwise put it
+    back.
 
-    Logs are those of the last run in any case.  Who holds the folder alone calls it: what killed
-    processes have left goes.  Raises PliantError, and has deleted nothing then.
+    Logs are those of the last run in any case.  The caller holds the folder exclusively: files that
+    killed processes left are deleted.  Raises PliantError, and then has deleted nothing.
     """
     try:
         clear_staging(output)
@@ -304,9 +305,9 @@ def _settle(output: Path) -> None:
 
 
 def has_frames(output: Path) -> bool:
-    """Whether anything of a frame is recorded, of which more may be made, though it is damaged.
+    """Whether data of any frame is recorded, from which results can be made even if it is damaged.
 
-    Raises RecordingError where that cannot be known.
+    Raises RecordingError if that cannot be known.
     """
     for part in parts.parts_of(output / RECORDING_NAME):
         with suppress(NothingReadableError):
@@ -317,7 +318,7 @@ def has_frames(output: Path) -> bool:
 
 
 def _result_in(output: Path) -> Iterator[Path]:
-    """The files and folders of a result that are there; not what was exported of it, nor logs."""
+    """The existing files and folders of a result, without exports and logs."""
     yield from _begun_in(output)
     files = {*_RIGID_FILES, *SOMETIMES, *MESH_FILES, SURFELS_NAME}
     for path in sorted(output.iterdir()):
@@ -326,7 +327,7 @@ def _result_in(output: Path) -> Iterator[Path]:
 
 
 def _begun_in(output: Path) -> Iterator[Path]:
-    """Files that a run without a frame may have made."""
+    """Files that a run without a frame may have written."""
     folder = parts.folder_of_parts(output / RECORDING_NAME)
     found = parts.parts_in(folder)
     yield from found
@@ -338,9 +339,9 @@ def _begun_in(output: Path) -> Iterator[Path]:
 
 
 def discard(output: Path, logs: Iterable[str]) -> None:
-    """Take away all that a run has left of which no frame is recorded, with logs of these names.
+    """Delete all files of a run without a recorded frame, and logs of these names.
 
-    Where an earlier result is set aside, it comes back by itself, with the logs of the last run.
+    An earlier result that is set aside is put back, with the logs of the last run.
     """
     if earlier.is_aside(output):
         return
@@ -378,24 +379,24 @@ def run_metadata(config: str) -> dict[str, dict[str, str]]:
 def commit_of(package: Path) -> str:
     """The commit of the checkout that a package is run from; "" for one that is installed.
 
-    A checkout of anything else may surround the place where it is installed.
+    It may be installed inside the checkout of another project.
     """
     git = ("git", "-C", package)
     own = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
 
-    def said(*arguments: str) -> str:
+    def output_of(*arguments: str) -> str:
         command = [*git, *arguments]
         done = subprocess.run(command, capture_output=True, text=True, timeout=5, env=own)
         return done.stdout.strip() if done.returncode == 0 else ""
 
     try:
-        tracked = said("ls-files", "--full-name", "__init__.py")
-        return said("rev-parse", "HEAD") if tracked == "shared/pliant/__init__.py" else ""
+        tracked = output_of("ls-files", "--full-name", "__init__.py")
+        return output_of("rev-parse", "HEAD") if tracked == "shared/pliant/__init__.py" else ""
     except (OSError, subprocess.SubprocessError):
         return ""
 
 
 def files_of(output: Path, report: dict[str, Any]) -> list[str]:
-    """Names of the files that a run with this report has left, but for its recording."""
+    """Names of the files of a run with this report, except its recording."""
     always = SURFEL_FILES if report.get("profile") == "deformable" else _RIGID_FILES
     return [*always, *(name for name in (*SOMETIMES, *MESH_FILES) if (output / name).exists())]

@@ -16,10 +16,10 @@ DOUBTS = 0.25
 """Share of doubtful poses above which a run is.  Good sequences have up to a sixth."""
 
 _FOLLOWED = 0.75
-"""Share of the surfels in view with which a frame is followed well.  Nine tenths of the frames of
-sequences with ground truth that surfels stay on have 0.84 and more (cloth, sheets that slide,
-breathing
-tissue behind an instrument); where an instrument tears tissue about, half of them have 0.67."""
+"""Share of the surfels in view that are tracked in a good frame.  In sequences with ground truth
+that are tracked well, nine tenths of the frames have 0.84 and more (cloth, sliding sheets,
+breathing tissue behind an instrument).  With an instrument that pulls tissue, half of them have
+0.67."""
 
 
 def doubtful_frames(history: MapHistory) -> list[int]:
@@ -39,7 +39,8 @@ def judge(
 
     frames: all, except those that a mask covers.   in_segments: poses in each segment of the map.
     doubtful: poses with that flag.   broken: frames that do not decode or have a wrong time.
-    absent: frames of the source that never came.   behind: frames without a pose for lack of time.
+    absent: announced frames of the source that never came.   behind: frames without a pose for lack
+    of time.
     by_gyro: frames that no image places, but the gyro between others.
     calibration: why it bends the map; "" if it does not.   focal: how the focal length changes
     during the clip; "" if it does not.   failed: the source broke off.
@@ -52,13 +53,13 @@ def judge(
     of_source = max(frames + absent, 1)
     share = longest / of_source
     which = "frames of the source" if broken or absent else "frames"
-    told = f"{share:.0%} of the {which} have a pose in the largest segment"
-    told += f", {by_gyro} are placed by the gyro alone" if by_gyro else ""
+    text = f"{share:.0%} of the {which} have a pose in the largest segment"
+    text += f", {by_gyro} are placed by the gyro alone" if by_gyro else ""
     if longest < _LITTLE * (of_source - behind):
-        return BAD, told
+        return BAD, text
     if share < _WHOLE and 2 * behind > of_source - longest:
         return DOUBTFUL, (
-            f"{told}: the computer was too slow for {behind / of_source:.0%}; use smaller images "
+            f"{text}: the computer was too slow for {behind / of_source:.0%}; use smaller images "
             "(--max-size) or fewer tracks (--light)"
         )
     if focal:
@@ -74,12 +75,12 @@ def judge(
     if broken > (1.0 - _WHOLE) * frames:
         return DOUBTFUL, f"{broken / frames:.0%} of the images are broken"
     if share < _WHOLE:
-        return DOUBTFUL, told
+        return DOUBTFUL, text
     if failed:
         return DOUBTFUL, "the source ended early"
     if calibration:
         return DOUBTFUL, calibration
-    return GOOD, told if longest < of_source else "all frames have a pose in one segment"
+    return GOOD, text if longest < of_source else "all frames have a pose in one segment"
 
 
 def slipping_frames(tracked: Sequence[int], in_view: Sequence[int]) -> list[int]:

@@ -48,7 +48,7 @@ class Scale:
     level: Level | None = None
 
     def times(self, other: "Scale") -> "Scale":
-        """Both together: ``other`` was found in the units of this one."""
+        """Return the product with ``other``, which was estimated in the units of this one."""
         level = other.level or self.level
         if self.level is not None and other.level is not None:
             level = level_of(other.level.R @ self.level.R, other.level.sigma_deg)
@@ -86,7 +86,7 @@ class Scale:
 
 
 UNSCALED = Scale(metres_per_unit=1.0, sigma=0.0, source="")
-"""Whatever the folder has: the unit and the axes of the recording."""
+"""The unit and the axes of the recording, whatever the folder has."""
 
 
 def level_of(R: F64, sigma_deg: float) -> Level:

@@ -1,6 +1,6 @@
 """The lock of a result folder, which holds even if the folder is renamed.
 
-It is a lock of the operating system, so that of a dead process is free.
+It is a lock of the operating system, which frees the locks of dead processes.
 """
 
 import errno
@@ -26,7 +26,7 @@ class Held:
     def __init__(self, output: Path, kind: int = fcntl.LOCK_EX) -> None:
         """kind: LOCK_EX, or LOCK_SH for several holders.
 
-        Raises ResultError where another process holds it, OSError where it cannot be written to.
+        Raises ResultError if another process holds it, OSError if it cannot be written to.
         """
         self._name = output
         self._folder = os.open(output, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -50,7 +50,7 @@ class Held:
         return None
 
     def release(self) -> None:
-        """Let go of it, and take the lock file away unless others hold it, too."""
+        """Release the lock, and delete its file unless others hold it, too."""
         with suppress(OSError):
             try:
                 fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -115,7 +115,7 @@ def held(output: Path, holder: str, *, elsewhere: bool = True) -> ResultError:
 
 
 def _opened(output: Path, folder: int) -> int:
-    """The lock file, which is there or made; never what a link leads to or what is no lock.
+    """Open the lock file, or create it; never the target of a link, or a file that is no lock.
 
     Raises ResultError, OSError.
     """

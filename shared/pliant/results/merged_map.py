@@ -51,7 +51,7 @@ def merge_maps(first: Path, second: Path, output: Path, *, force: bool) -> Itera
     except OSError as error:
         raise MapError(f"{output}: the map cannot be written: {error.strerror}") from None
     write_map(output, header, _messages(merged))
-    yield from _told(merged, second, output)
+    yield from _summary(merged, second, output)
 
 
 def _messages(merged: Merged) -> Iterator[MapKeyframe]:
@@ -60,7 +60,7 @@ def _messages(merged: Merged) -> Iterator[MapKeyframe]:
         yield MapKeyframe.of(header, keyframe)
 
 
-def _told(merged: Merged, second: Path, output: Path) -> Iterator[str]:
+def _summary(merged: Merged, second: Path, output: Path) -> Iterator[str]:
     points = sum(len(each.point_ids) for each in merged.keyframes)
     yield f"{output}: {counted(len(merged.keyframes), 'keyframe')}, {counted(points, 'point')}"
     for old, segment in merged.joined:

@@ -1,4 +1,4 @@
-"""The meshes of a recording as the files that a user opens."""
+"""Writes the meshes of a recording as files for users."""
 
 import json
 import os
@@ -33,7 +33,7 @@ def meshes_of(pieces: Sequence[MeshPiece]) -> dict[tuple[int, str], list[MeshPie
 
 
 def mesh_of(pieces: Sequence[MeshPiece], segment: int) -> TriangleMesh | None:
-    """The fine one of a segment, None where it is not there."""
+    """The fine mesh of a segment, or None."""
     found = meshes_of(pieces).get((segment, "fine"))
     return None if found is None else joined(found)
 
@@ -53,7 +53,7 @@ def write_meshes(
 
 
 def write_mesh(path: Path, mesh: TriangleMesh) -> None:
-    """A PLY file; vertices that close holes are marked where there are any."""
+    """Write a PLY file; vertices that close holes are marked, if there are any."""
     write_ply(
         path, mesh.positions, mesh.colours, normals=mesh.normals, faces=mesh.triangles,
         closed=mesh.closed if len(mesh.closed) else None,
@@ -76,7 +76,7 @@ def read_mesh(path: Path) -> TriangleMesh | None:
 
 
 def write_pictures(folder: Path, mesh: TriangleMesh, T_world_camera: F64, suffix: str = "") -> None:
-    """The mesh in its colours, shaded, and its normals."""
+    """Draw the mesh in its colours, shaded, and by its normals."""
     pictures = draw_mesh(mesh, mesh_view(mesh, T_world_camera))
     write_image(folder / f"mesh{suffix}.png", pictures.colours)
     write_image(folder / f"mesh_shaded{suffix}.png", pictures.shaded)
@@ -91,7 +91,7 @@ def place_of(recording: Path, folder: Path) -> dict[str, str]:
 def run_of(folder: Path) -> Path:
     """The result folder of the run: that of a folder of ``pliant mesh``, else the folder itself.
 
-    Raises ResultError where the report does not name a recording that is there.
+    Raises ResultError if the report does not name a recording that is there.
     """
     report = folder / MESHED_NAME
     if not report.is_file():

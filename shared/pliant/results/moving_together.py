@@ -7,7 +7,7 @@ from pliant.algorithms.geometry import align_umeyama
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 
 _FAR = 0.02
-"""Motion since the reference that tells something, as a share of the depth: what a surfel is
+"""Motion since the reference that is significant, as a share of the depth: what a surfel is
 expected to move by itself (``surfels.expected_motion``)."""
 
 _LEFT = 0.1

@@ -98,7 +98,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
 
 
 def last_reason(reasons: Sequence[str]) -> str:
-    """The last of the reasons why frames have no pose, or what most images look like."""
+    """The last reason why frames have no pose, or the common fault of most images."""
     for flaw in FLAWS:
         count = reasons.count(flaw)
         if 2 * count > len(reasons):
@@ -135,7 +135,7 @@ def process_figures(run: Run, frames: int) -> dict[str, Any]:
 
 
 def absent_frames(run: Run, came: int) -> int:
-    """Frames that the source announced and that never came."""
+    """Number of frames that the source announced and that never came."""
     announced = -1 if run.stream is None else run.stream.frames
     # Containers of videos count their frames roughly.
     roughly = 0 if run.source_failure else max(2, _ROUGHLY * announced)
@@ -143,7 +143,7 @@ def absent_frames(run: Run, came: int) -> int:
 
 
 def source_failed(run: Run) -> bool:
-    """Whether the source broke off.  A live one has no end of its own."""
+    """Whether the source ended early.  A live source has no end of its own."""
     return bool(run.source_failure) and run.stream is not None and run.stream.mode != "live"
 
 
@@ -176,7 +176,7 @@ def _well_observed(run: Run, final: dict[int, Any]) -> int:
 
 
 def _known_map(run: Run, final: dict[int, Any]) -> dict[str, Any] | None:
-    """How the run found its way in the map of earlier sessions; None where it had none.
+    """How the run found its way in the map of earlier sessions; None if it had none.
 
     looked: frames before the first that was in it as it came, by itself or as its segment joined.
     """

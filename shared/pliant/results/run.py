@@ -95,7 +95,7 @@ class Run:
     @property
     def focal_range(self) -> tuple[float, float] | None:
         """The least and the greatest focal length, in units of the calibration that was found, but
-        for a twentieth of the keyframes at each end; None where it does not change."""
+        for a twentieth of the keyframes at each end; None if it does not change."""
         if not any(self.log_focals.values()):
             return None
         low, high = np.exp(np.percentile([*self.log_focals.values()], (5.0, 95.0))).tolist()
@@ -213,9 +213,9 @@ def seen_by_keyframes(recording: Recording, wanted: Container[int]) -> dict[int,
             ends = np.cumsum(message.counts)
             for row, number in enumerate(message.keyframe_ids.tolist()):
                 if number in wanted:
-                    told = slice(int(ends[row] - message.counts[row]), int(ends[row]))
-                    seen[number].point_ids = message.point_ids[told]
-                    seen[number].points_px = message.points_px[told]
+                    part = slice(int(ends[row] - message.counts[row]), int(ends[row]))
+                    seen[number].point_ids = message.point_ids[part]
+                    seen[number].points_px = message.points_px[part]
     return dict(seen)
 
 

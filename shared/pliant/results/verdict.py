@@ -42,7 +42,7 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
             f"age of an image when its pose is published: median {age['p50']:.0f} ms, "
             f"99 % below {age['p99']:.0f} ms"
         )
-    lines += _told_of_map(report)
+    lines += _map_lines(report)
     lines += _dropped_parts(report.get("counters", {}).get("bundle_adjustment", {}))
     lines += [
         f"{mesh['level']} mesh: {mesh['triangles']} triangles "
@@ -50,7 +50,7 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
         for mesh in report["mesh"]
         if mesh["level"] == "fine"
     ]
-    lines += _told_by_gyro(report)
+    lines += _gyro_lines(report)
     lines += _scale_lines(report)
     lens = report.get("calibration_verdict")
     lines += [lens] if lens and lens != report["verdict_reason"] else []
@@ -75,7 +75,7 @@ def _mapped(report: dict[str, Any]) -> str:
     return f"{report['median_inliers_per_frame']:.0f} mapped inliers"
 
 
-def _told_of_map(report: dict[str, Any]) -> list[str]:
+def _map_lines(report: dict[str, Any]) -> list[str]:
     """How the run found its way in the map of earlier sessions."""
     known = report.get("known_map")
     if known is None:
@@ -104,7 +104,7 @@ def _scale_lines(report: dict[str, Any]) -> list[str]:
     return lines + [f"{sensor} not used: {why}" for sensor, why in refusals.items() if why]
 
 
-def _told_by_gyro(report: dict[str, Any]) -> list[str]:
+def _gyro_lines(report: dict[str, Any]) -> list[str]:
     """Lines about the poses by the gyro, if there are any."""
     counters = report.get("counters", {}).get("bundle_adjustment", {})
     carried, lines = report.get("frames_by_gyro", []), list[str]()
@@ -164,13 +164,13 @@ def _faults(report: dict[str, Any]) -> list[str]:
             "without a pose"
         )
     if broken:
-        lines.append(f"{counted(len(broken), 'broken image')}: {_told_of_broken(broken)}")
+        lines.append(f"{counted(len(broken), 'broken image')}: {_broken_frames(broken)}")
     if report["ended_early"]:
         lines.append(f"ended early: {report['ended_early']}")
     return lines
 
 
-def _told_of_broken(broken: Mapping[str, str]) -> str:
+def _broken_frames(broken: Mapping[str, str]) -> str:
     """The fault of the first, and the numbers of the others, as the source counts them."""
     first, *others = (why.removeprefix(BROKEN) for why in broken.values())
     if not others:

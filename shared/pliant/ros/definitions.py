@@ -19,7 +19,7 @@ class RosError(PliantError):
 
 @cache
 def definitions() -> Any:
-    """rosbags' store of types.  Raises RosError where rosbags is missing."""
+    """rosbags' store of types.  Raises RosError if rosbags is missing."""
     try:
         typesys: Any = importlib.import_module("rosbags.typesys")
     except ImportError:
@@ -39,7 +39,7 @@ def serialised(message: Any) -> bytes:
     return bytes(definitions().serialize_cdr(message, message.__msgtype__))
 
 
-def made(kind: str, **said: Any) -> Any:
+def made(kind: str, **given: Any) -> Any:
     """A message of a type; what is not said is zero or empty.
 
     A field that is a message takes it, or a dictionary of its fields.
@@ -47,7 +47,7 @@ def made(kind: str, **said: Any) -> Any:
     store = definitions()
     values: dict[str, Any] = {}
     for name, (node, detail) in store.get_msgdef(kind).fields:
-        value = said.pop(name, None)
+        value = given.pop(name, None)
         if node.name == "NAME" and (value is None or isinstance(value, dict)):
             value = made(detail, **(value or {}))
         elif node.name in ("ARRAY", "SEQUENCE"):
@@ -59,8 +59,8 @@ def made(kind: str, **said: Any) -> Any:
         elif value is None:
             value = "" if detail[0] == "string" else 0
         values[name] = value
-    if said:
-        raise TypeError(f"{kind} has no {', '.join(said)}")
+    if given:
+        raise TypeError(f"{kind} has no {', '.join(given)}")
     return store.types[kind](**values)
 
 

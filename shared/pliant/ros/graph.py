@@ -26,11 +26,11 @@ _LARGEST_DOMAIN = 232
 
 
 def domain_id() -> int:
-    """ROS_DOMAIN_ID, 0 where it is not set.  Raises RosError where it is no domain."""
-    said = os.environ.get("ROS_DOMAIN_ID", "") or "0"
-    if not said.isdecimal() or int(said) > _LARGEST_DOMAIN:
-        raise RosError(f"ROS_DOMAIN_ID={said}: not a number from 0 to {_LARGEST_DOMAIN}")
-    return int(said)
+    """ROS_DOMAIN_ID, 0 where it is not set.  Raises RosError if it is no domain."""
+    domain = os.environ.get("ROS_DOMAIN_ID", "") or "0"
+    if not domain.isdecimal() or int(domain) > _LARGEST_DOMAIN:
+        raise RosError(f"ROS_DOMAIN_ID={domain}: not a number from 0 to {_LARGEST_DOMAIN}")
+    return int(domain)
 
 
 @dataclass(frozen=True)

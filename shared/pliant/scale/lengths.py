@@ -38,8 +38,8 @@ def from_points(run: Run, a: Sequence[float], b: Sequence[float], metres: float)
     if not 0.0 < metres < np.inf:
         raise ResultError(f"{metres:g} metres: expected a positive length")
     _check_mapped(run, a, b)
-    told = f"two points {metres:g} m apart"
-    return Scale(metres_per_unit=metres / apart, sigma=0.0, source=told)
+    text = f"two points {metres:g} m apart"
+    return Scale(metres_per_unit=metres / apart, sigma=0.0, source=text)
 
 
 def _check_mapped(run: Run, *places: Sequence[float]) -> None:
@@ -54,9 +54,9 @@ def _check_mapped(run: Run, *places: Sequence[float]) -> None:
     for place in places:
         off = float(np.linalg.norm(mapped - np.asarray(place), axis=1).min(initial=np.inf))
         if off > _FAR * spread:
-            told = ",".join(f"{value:g}" for value in place)
+            text = ",".join(f"{value:g}" for value in place)
             raise ResultError(
-                f"--points: {told} is outside of the map, whose nearest point is {off:.3g} away: "
+                f"--points: {text} is outside of the map, whose nearest point is {off:.3g} away: "
                 "pick both in report.html"
             )
 
@@ -64,7 +64,7 @@ def _check_mapped(run: Run, *places: Sequence[float]) -> None:
 def from_depth(recording: Recording, run: Run, source: str) -> Scale:
     """By the depth maps of the run's source, or of another with the same images and stamps.
 
-    Each keyframe tells a ratio, the median of measured depth by that of the map over the points
+    Each keyframe gives a ratio, the median of measured depth by that of the map over the points
     that it sees; the scale is the median of these, its sigma their spread, as all share the errors
     of a sensor.  Raises PliantError.
     """
@@ -99,8 +99,8 @@ def from_depth(recording: Recording, run: Run, source: str) -> Scale:
     logs = np.log(ratios)
     middle = float(np.median(logs))
     sigma = _TO_SIGMA * float(np.median(np.abs(logs - middle)))
-    told = f"depth maps of {counted(len(logs), 'keyframe')}"
-    return Scale(metres_per_unit=float(np.exp(middle)), sigma=sigma, source=told)
+    text = f"depth maps of {counted(len(logs), 'keyframe')}"
+    return Scale(metres_per_unit=float(np.exp(middle)), sigma=sigma, source=text)
 
 
 def _ratio(depth: F64, camera: PinholeCamera, rays: F64, z: F64) -> float | None:

@@ -34,21 +34,21 @@ def from_marker(recording: Recording, run: Run, metres: float) -> Scale:
     if not 0.0 < metres < np.inf:
         raise ResultError(f"--marker {metres:g}: expected a positive length")
     ideal = IdealCamera(run)
-    told: list[tuple[float, float]] = []
+    measured: list[tuple[float, float]] = []
     found = _markers(recording, ideal)
     for views in found.values():
         side = _side(views, ideal)
         if side is not None:
-            told.append((metres / side[0], side[1]))
-    if not told:
+            measured.append((metres / side[0], side[1]))
+    if not measured:
         seen = f"{len(found)} found, but none as a square in {_LEAST_VIEWS} keyframes"
         raise ResultError(
             f"{recording.path}: no marker: {seen if found else 'keyframes see none'} (ArUco, or "
             "AprilTag 36h11; film it from several sides)"
         )
-    factors, spreads = np.array(told).T
+    factors, spreads = np.array(measured).T
     sigma = float(np.median(spreads))
-    source = f"{counted(len(told), 'marker')} of {metres:g} m"
+    source = f"{counted(len(measured), 'marker')} of {metres:g} m"
     return Scale(metres_per_unit=float(np.median(factors)), sigma=sigma, source=source)
 
 

@@ -78,7 +78,7 @@ class Scene:
     def take(self, topic: Topic, message: Header, sequence: int, arrived_ns: int) -> None:
         """Draw a message.
 
-        sequence: its number in its topic, which tells what was missed.    arrived_ns: when it came,
+        sequence: its number in its topic, which shows what was missed.    arrived_ns: when it came,
         by whatever clock: rates are measured by it.
         """
         at = Moment(message.frame, message.stamp_ns)
@@ -157,7 +157,7 @@ class Scene:
         world.moved = world.moved or bool(mine.any())
         self._take_places(at, update, final=final)
         here = update.point_segments == world.segment
-        world.points.tell(
+        world.points.update(
             update.point_ids[here],
             update.points_world[here].astype(np.float32),
             update.point_colours[here],

@@ -53,7 +53,7 @@ class FoxgloveFile:
     dims_masks = True
 
     def __init__(self, path: Path) -> None:
-        """Raises ResultError where the definitions are missing or the file cannot be written."""
+        """Raises ResultError if the definitions are missing or the file cannot be written."""
         self._path = path
         self._kinds: dict[str, Any] = {}
         self._channels: dict[str, int] = {}

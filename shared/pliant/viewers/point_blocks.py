@@ -28,7 +28,7 @@ class PointBlocks:
     def __len__(self) -> int:
         return int(np.count_nonzero(self._alive))
 
-    def tell(
+    def update(
         self, ids: I64, xyz: F32, rgb: U8, hosts: I64, removed: I64, *, snapshot: bool
     ) -> None:
         """Take in new, changed and removed points.  snapshot: ``ids`` are all active ones.

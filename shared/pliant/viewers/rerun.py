@@ -8,8 +8,8 @@
     curves/lag, milliseconds, rate, stages      how the services fare
     notes                                       lines for the user
 
-The camera is beside the worlds of the map's segments, so that the image stays where it is when
-the map is lost and the next world begins.
+The camera is outside the worlds of the map's segments.  So the image stays in its place when the
+map is lost and the next world begins.
 
 Time runs by "frame" and by "capture".  Needs Rerun: ``pip install 'pliant[view]'``.
 """
@@ -56,7 +56,7 @@ _IMAGE = f"{_CAMERA}/image"
 
 
 def load_rerun() -> Any:
-    """The library, told to send nothing to its makers.  ResultError where it is missing."""
+    """The library, told to send nothing to its makers.  ResultError if it is missing."""
     # Read when the library is loaded, and by the viewer that it starts.
     for name in ("RERUN_ANALYTICS_ENABLED", "RERUN_ALLOW_UPDATE_CHECK"):
         os.environ[name] = "0"
@@ -72,7 +72,7 @@ class RerunCanvas:
     dims_masks = True
 
     def __init__(self, where: Where, *, name: str, web_port: int | None = None) -> None:
-        """Open it.  Raises ResultError where Rerun is missing or the file cannot be written.
+        """Open it.  Raises ResultError if Rerun is missing or the file cannot be written.
 
         web_port: where a browser finds it, by default Rerun's own, or where that is taken another
         that is free.
@@ -129,7 +129,7 @@ class RerunCanvas:
 
     @property
     def is_watched(self) -> bool:
-        """False where a window was to be drawn in and is closed, or never opened."""
+        """False if a window was to be drawn in and is closed, or never opened."""
         if not self._is_window:
             return True
         return listens(_GRPC_PORT)

@@ -61,7 +61,7 @@ class RerunData:
 
     def since(self, number: int) -> list[tuple[int, bytes]] | None:
         """The next parts from this number on, each with its number: no more than a slow browser may
-        hold, which are not dropped meanwhile.  Waits for one; None where none comes."""
+        hold, which are not dropped meanwhile.  Waits for one; None if none comes."""
         with self._changed:
             self._changed.wait_for(lambda: self._is_over or self._parts > number)
             parts = [item for item in (*self._kept, *self._passing) if item[0] >= number]

@@ -43,7 +43,7 @@ class RerunPage:
         """Take the port.
 
         behind: the port at which Rerun's program has its page.    data: what it shows.
-        Raises ResultError where the port is taken.
+        Raises ResultError if the port is taken.
         """
         token = secrets.token_urlsafe()
         root = f"http://localhost:{port}/{token}"
@@ -52,10 +52,10 @@ class RerunPage:
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
-                told, slash, rest = self.path[1:].partition("/")
+                given, slash, rest = self.path[1:].partition("/")
                 if not _THIS_MACHINE.fullmatch(self.headers.get("Host", "")):
                     self.send_error(403)
-                elif not hmac.compare_digest(told.encode(), token.encode()):
+                elif not hmac.compare_digest(given.encode(), token.encode()):
                     self.send_error(404)
                 elif slash + rest == _DATA:
                     self._send_data()

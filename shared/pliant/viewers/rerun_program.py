@@ -24,7 +24,7 @@ class RerunProgram:
         """Start it and wait until it listens.
 
         ports: those that it listens on; the first one takes the data.    arguments: the rest.
-        Raises ResultError where a port is taken, or the program does not come up.
+        Raises ResultError if a port is taken, or the program does not come up.
         """
         for port in ports:
             if listens(port):

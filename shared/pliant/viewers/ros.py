@@ -87,10 +87,10 @@ class RosCanvas:
 
     def image(self, at: Moment, data: bytes, encoding: str) -> None:
         """The image and its camera."""
-        self._tell("image", partial(_image, at, data, encoding))
+        self._publish("image", partial(_image, at, data, encoding))
         if self._camera is not None:
-            self._tell("camera", partial(_camera_info, at, self._camera, self._lens))
-        self._tell_again()
+            self._publish("camera", partial(_camera_info, at, self._camera, self._lens))
+        self._publish_again()
 
     def tracks(self, at: Moment, points_px: F32, ages: I32) -> None:
         """ROS has no message for them."""
@@ -100,24 +100,24 @@ class RosCanvas:
         world = world_name(segment)
         frames = ((MAP, world, self._world), (world, OPTICAL, pose_world_camera))
         frames = (*frames, (OPTICAL, LINK, matrix_to_pose(inverse(pose_to_matrix(_UP)))))
-        self._tell("tf", partial(_transforms, at, frames))
+        self._publish("tf", partial(_transforms, at, frames))
         T_map_optical = pose_to_matrix(self._world) @ pose_to_matrix(pose_world_camera)
         T_map_link = T_map_optical @ inverse(pose_to_matrix(_UP))
         pose = _pose(matrix_to_pose(T_map_link))
         kind = "geometry_msgs/msg/PoseStamped"
         stamped = made(kind, header=header(at.stamp_ns, MAP), pose=pose)
-        self._tell("pose", partial(serialised, stamped))
+        self._publish("pose", partial(serialised, stamped))
 
     def path(self, at: Moment, segment: int, positions: F64) -> None:
         """Publish the keyframes, without their directions."""
-        self._tell("path", partial(_path, at, world_name(segment), positions), keep="")
+        self._publish("path", partial(_path, at, world_name(segment), positions), keep="")
 
     def places(self, at: Moment, segment: int, lines: F64) -> None:
         """Not published: the path shows where the camera was."""
 
     def points(self, at: Moment, segment: int, points: PointBlocks, changed: list[int]) -> None:
         """The cloud."""
-        self._tell("points", partial(_cloud, at, world_name(segment), points), keep="")
+        self._publish("points", partial(_cloud, at, world_name(segment), points), keep="")
 
     def whole_map(self, at: Moment, segment: int, points: PointBlocks) -> None:
         """The cloud."""
@@ -126,7 +126,7 @@ class RosCanvas:
     def mesh(self, at: Moment, segment: int, name: str, mesh: TriangleMesh) -> None:
         """A marker for each piece."""
         number = self._ids.setdefault(name, len(self._ids))
-        self._tell(
+        self._publish(
             "mesh", partial(marker, at, world_name(segment), "mesh", number, mesh), keep=name
         )
         if not len(mesh.triangles):
@@ -134,12 +134,14 @@ class RosCanvas:
 
     def surfels(self, at: Moment, segment: int, surfels: SurfelPicture) -> None:
         """One marker."""
-        self._tell("surfels", partial(marker, at, world_name(segment), "surfels", 0, surfels.quads))
+        self._publish(
+            "surfels", partial(marker, at, world_name(segment), "surfels", 0, surfels.quads)
+        )
 
     def surface(self, at: Moment, segment: int, mesh: TriangleMesh) -> None:
         """One more marker of the surfels."""
         make = partial(marker, at, world_name(segment), "surface", 0, mesh)
-        self._tell("surfels", make)
+        self._publish("surfels", make)
 
     def forget(self, at: Moment, segment: int) -> None:
         """Take the mesh of a segment away."""
@@ -150,7 +152,7 @@ class RosCanvas:
                 header=header(at.stamp_ns, world_name(segment)),
                 action=_DELETE_ALL,
             )
-            self._tell(key, partial(serialised, gone))
+            self._publish(key, partial(serialised, gone))
 
     def measure(self, at: Moment, name: str, value: float) -> None:
         """ROS has no message for it."""
@@ -160,7 +162,7 @@ class RosCanvas:
 
     # -- sending -------------------------------------------------------------------------------
 
-    def _tell(self, key: str, make: Make, *, keep: str | None = None) -> None:
+    def _publish(self, key: str, make: Make, *, keep: str | None = None) -> None:
         """Publish if there are subscribers.  keep: name under which it is repeated for
         later ones.
         """
@@ -169,7 +171,7 @@ class RosCanvas:
         if self._publishers[key].is_heard:
             self._publishers[key].put(make())
 
-    def _tell_again(self) -> None:
+    def _publish_again(self) -> None:
         """Repeat messages for new subscribers: here, because Zenoh may not be called from a
         callback.
         """

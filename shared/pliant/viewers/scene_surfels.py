@@ -34,7 +34,7 @@ class SceneSurfels:
         self._most = 0
 
     def take(self, at: Moment, surfels: Surfels) -> None:
-        """Draw the surfels of a frame; nothing where it has none."""
+        """Draw the surfels of a frame; nothing if it has none."""
         if self.camera is None or surfels.missing:
             return
         if surfels.segment != self._segment:

@@ -32,7 +32,7 @@ def packed(used: BoolArray) -> bytes:
 
 
 def unpacked(data: bytes) -> BoolArray:
-    """The mask (H, W) in an image file of one channel.  Raises ValueError where it is none."""
+    """The mask (H, W) in an image file of one channel.  Raises ValueError if it is none."""
     pixels = decoded(data, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.ndim != 2:
         raise ValueError("no image that can be read")
@@ -42,7 +42,7 @@ def unpacked(data: bytes) -> BoolArray:
 def scaled(used: BoolArray, size: tuple[int, int]) -> BoolArray:
     """The mask of an image of another size (width, height): used is what is so as a whole.
 
-    Raises ValueError where the aspect is another one, by more than rounding makes.
+    Raises ValueError if the aspect is another one, by more than rounding makes.
     """
     height, width = used.shape
     if abs(width * size[1] - height * size[0]) > max(*size, width, height):

@@ -1,8 +1,8 @@
 """Regions that stay the same while the scene moves: borders, overlays, parts of the vehicle.
 
-Frames count as evidence only if most of the texture in the image has moved since the last one that
-counted, so a camera that stands still gives none.  What remains in such frames at the same place is
-not part of the scene:
+A frame counts as evidence only if most of the texture has moved since the last frame that counted.
+So a still camera gives none.  What remains in such frames at the same place is not part of the
+scene:
 
     border     a dark, flat region along the image's edge with a sharp outline that does not move:
                the outside of an endoscope's circle, bars above and below a film

@@ -70,7 +70,7 @@ def triangulate(points_px: F32 | F64) -> Triangulation:
     on a circle it is always the same one.  Points that are not finite are left out; fewer than
     three points, or collinear ones, give no triangle.
 
-    Raises ValueError where the points are not (N, 2).
+    Raises ValueError if the points are not (N, 2).
     """
     if points_px.ndim != 2 or points_px.shape[1] != 2:
         raise ValueError(f"points_px: expected shape (N, 2), got {points_px.shape}")

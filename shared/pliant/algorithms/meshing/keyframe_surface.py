@@ -15,6 +15,10 @@ from pliant.algorithms.meshing.rendering import DepthMap, DrawnTriangles
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.compiler.kernel import kernel
 
+_MAX_ERROR_PX = 2.0
+"""Maximum reprojection error of a landmark that is used."""
+_MAX_RELATIVE_SIGMA = 0.1
+"""Of the inverse depth of a triangle's corner."""
 _MIN_POINTS = 3
 _MIN_SHARED = 0.3
 """Share of the vertices that must live on for the last surface to be worth starting from."""
@@ -121,9 +125,7 @@ class KeyframeSurfaces:
         with np.errstate(all="ignore"):
             inverses = 1.0 / in_camera[:, 2]
             error = self._camera.project(in_camera) - points.points_px
-            good = (inverses > 0.0) & (
-                np.square(error).sum(axis=1) < self._parameters.max_error_px**2
-            )
+            good = (inverses > 0.0) & (np.square(error).sum(axis=1) < _MAX_ERROR_PX**2)
         good &= np.isfinite(inverses) & np.isfinite(points.sigmas) & (points.sigmas > 0.0)
         rows = np.flatnonzero(good)
         chosen = SeenPoints(
@@ -200,7 +202,7 @@ def filter_triangles(
         np.isfinite(points_px).all(axis=1)
         & np.isfinite(inverse_depths)
         & (inverse_depths > 0.0)
-        & (sigmas <= parameters.max_relative_sigma * inverse_depths)
+        & (sigmas <= _MAX_RELATIVE_SIGMA * inverse_depths)
         & (observations >= parameters.min_observations)
     )
     rays = np.ones((len(points_px), 3))

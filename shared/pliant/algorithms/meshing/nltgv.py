@@ -23,7 +23,7 @@ T_k = 1 / sum_e |K_ek| and S_e = 1 / sum_k |K_ek|, written for the weighted q ab
 for any weights, however much they and the lengths of edges differ.
 
 Steps.  A convex energy rounds a step, or closes it over an outlier.  So the weights m_e and n_i
-fall with the residuals, 1 / (1 + (r / k sigma)^2), taken anew ``reweightings`` times; for each set
+fall with the residuals, 1 / (1 + (r / k sigma)^2), recomputed ``reweightings`` times; for each set
 the convex problem is solved from where the last one ended, at first from planes averaged among
 neighbours that agree.  Before each set vertices that were outvoted at a step change to a
 neighbour's surface that agrees with their data, and those whose data agree with none (outliers)
@@ -51,6 +51,8 @@ from pliant.compiler.kernel import fast_kernel, kernel
 
 _MIN_SHIFT_SIGMAS = 3.0
 _HALF_U, _HALF_V, _FIRST, _SECOND, _FIRST_STEP, _SECOND_STEP = range(6)
+_RELAXATION = 1.9
+"""Over-relaxation of the iteration (rho)."""
 _MIN_LENGTH = 0.2
 """Edges shorter than this (in mean edges) weigh no more: their slopes are noise."""
 _MIN_WEIGHT = 1e-3
@@ -124,7 +126,7 @@ def smooth(
     same for any order of the points.    start_from: its surface gives the weights at once, so one
     set of weights is enough.
 
-    Raises ValueError where sizes differ.
+    Raises ValueError if sizes differ.
     """
     M, E = len(points_px), len(edges)
     if inverse_depths.shape != (M,) or sigmas.shape != (M,):
@@ -162,7 +164,7 @@ def smooth(
         )  # fmt: skip
         done, change = _iterate(
             data, directed, weights, state, duals,
-            parameters.relaxation, parameters.min_change_sigmas, parameters.max_iterations,
+            _RELAXATION, parameters.min_change_sigmas, parameters.max_iterations,
         )  # fmt: skip
         total += done
     return NltgvResult(

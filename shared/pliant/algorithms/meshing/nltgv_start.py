@@ -1,8 +1,8 @@
 """Where NLTGV starts, and which side of a step a vertex is on: kernels before each set of weights.
 
 Start.  Outliers are replaced by what neighbours agree on, then planes are averaged.  The iteration
-carries news by one edge at a time and is slow to flatten what is wide, so a surface that is already
-nearly flat where it should be saves most of it.
+spreads a change by one edge at a time and flattens wide areas slowly.  So a start with a surface
+that is already nearly flat there saves most of it.
 
 Sides.  A convex energy, like any vote among the neighbours, gives a vertex at a step to the side
 with more of them.  Vertices with data are moved by their data, the others by where the border must
@@ -182,7 +182,7 @@ def settle(graph: Graph, usual: F32, rows: I32, state: F32) -> None:
 
     usual: (M,) see usual_rise.  All rows of a pass come from the pass before, so that the order of
     the vertices does not matter.  It is the iteration's energy with squares for norms and weights
-    taken anew in every pass, by Jacobi: near its optimum after few of them, but rounder.
+    recomputed in every pass, by Jacobi: near its optimum after few of them, but rounder.
     """
     u, v, data, sigma, starts, neighbours = graph
     later = np.empty((len(rows), 3), np.float32)

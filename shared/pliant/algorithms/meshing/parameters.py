@@ -60,9 +60,6 @@ class NltgvParameters(Parameters):
             "median sigmas)."
         ),
     )
-    relaxation: float = Field(
-        default=1.9, ge=1.0, lt=2.0, description="Over-relaxation of the iteration (rho)."
-    )
 
 
 class TriangleFilterParameters(Parameters):
@@ -82,11 +79,6 @@ class TriangleFilterParameters(Parameters):
         le=90.0,
         description="Maximum angle between a triangle's normal and the ray to its centre, degrees.",
     )
-    max_relative_sigma: float = Field(
-        default=0.1,
-        gt=0.0,
-        description="Maximum relative sigma of a corner's inverse depth.",
-    )
     min_observations: int = Field(
         default=2, ge=1, description="Minimum frames that observe a corner."
     )
@@ -95,11 +87,6 @@ class TriangleFilterParameters(Parameters):
 class SurfaceParameters(Parameters):
     """How the points of a keyframe become a surface."""
 
-    max_error_px: float = Field(
-        default=2.0,
-        gt=0.0,
-        description="Landmarks with a larger reprojection error are not used, px.",
-    )
     noise_px: float = Field(
         default=0.5,
         gt=0.0,

@@ -65,8 +65,8 @@ def render_depth(
     or not in front of the camera are left out.
 
     The weight is the cosine of the slant, over 1 + the variance of depth in units of (1 % of
-    depth)^2.  A pixel centre on an edge belongs to the triangle on whose upper or left side it is,
-    so that two triangles that share an edge leave no gap and cover nothing twice.
+    depth)^2.  A pixel centre on an edge belongs to the triangle on whose upper or left side it is.
+    So two triangles with a common edge leave no gap and cover no pixel twice.
     """
     shape = (camera.height, camera.width)
     nearest, weights = np.zeros(shape, np.float32), np.zeros(shape, np.float32)

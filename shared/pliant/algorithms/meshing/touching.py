@@ -13,7 +13,7 @@ def taken_apart(positions: F32, triangles: I32) -> tuple[F32, I32]:
     share a new vertex at the old place, so the sheets still touch.  Vertices that two edges join
     get a vertex in the middle of one of these.
 
-    Raises ValueError where the surface has a border, or neighbours that turn against each other.
+    Raises ValueError if the surface has a border, or neighbours that turn against each other.
     """
     while True:
         forth, back = _twins(triangles)

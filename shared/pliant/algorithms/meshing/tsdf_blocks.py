@@ -98,7 +98,7 @@ class BlockPool:
     def add(self, keys: I32, birth: int) -> None:
         """Take in (K, 3) keys that are not here, with voxels of zeros.
 
-        Raises ValueError where they are more than there is ever room for; nothing has changed then.
+        Raises ValueError if they are more than there is ever room for; nothing has changed then.
         """
         used, total = len(self.keys), len(self.keys) + len(keys)
         if total > self.where.most:

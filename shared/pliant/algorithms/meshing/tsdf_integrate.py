@@ -65,7 +65,7 @@ class PixelPlanes(NamedTuple):
 def pixel_planes(depth: F32, weight: F32, camera: PinholeCamera) -> PixelPlanes:
     """depth: (H, W) along z, 0 or not finite where there is none.    weight: (H, W) in [0, 1].
 
-    Raises ValueError where they are not of the camera's size.
+    Raises ValueError if they are not of the camera's size.
     """
     shape = (camera.height, camera.width)
     if depth.shape != shape or weight.shape != shape:

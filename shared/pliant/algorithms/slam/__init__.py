@@ -11,7 +11,7 @@ start: the first map.
 places: place recognition, relocalisation.
 store: maps of earlier segments and sessions.
 active: the segment that the camera is in, and the pose of a frame in it.
-atlas: all segments, and how they merge.
+atlas: all segments and how they merge, the poses of all frames, and what is published of both.
 
 Begin with ``mapper.py``.  Three classes process frames, each a ``FrameMapper``: ``Mapper``,
 ``Localiser`` in a loaded map, and ``BootstrapMapper`` of an unknown camera.

@@ -59,7 +59,7 @@ class BootstrapMapper:
         samples: ImuSamples | None = None,
     ) -> None:
         """known, samples: as of ``Mapper``; the trial ignores them."""
-        self._anew = (camera, parameters, seed)
+        self._given = (camera, parameters, seed)
         self._known, self._samples = list(known), samples
         self._mapper = Mapper(camera, parameters, seed)
         self._taken: list[_Taken] = []
@@ -71,7 +71,7 @@ class BootstrapMapper:
             return self._mapper.process(frame, timer)
         outcome = self._mapper.take(frame, timer)
         taken, first = _Taken(frame), self._first
-        kept = keep_newest(self._taken, taken, self._anew[1].start)
+        kept = keep_newest(self._taken, taken, self._given[1].start)
         uncertain = float(self._mapper.calibration.sigmas[0])
         ready = first is not None and (uncertain < _KNOWN or kept[0].frame.number > first)
         if ready and outcome.state == TRACKING:
@@ -140,14 +140,14 @@ class BootstrapMapper:
     def _map_all_taken(self, timer: StageTimer) -> Outcome:
         """Map all waiting frames with the estimated camera.  Returns the newest outcome."""
         self._mapper = Mapper(
-            *self._anew, self._mapper.calibration, known=self._known, samples=self._samples
+            *self._given, self._mapper.calibration, known=self._known, samples=self._samples
         )
         self._samples = None
         self._on_trial = False
         taken, self._taken = self._taken, []
-        return [self._again(each, timer) for each in taken][-1]
+        return [self._map_again(each, timer) for each in taken][-1]
 
-    def _again(self, taken: _Taken, timer: StageTimer) -> Outcome:
+    def _map_again(self, taken: _Taken, timer: StageTimer) -> Outcome:
         if taken.is_mapped:
             outcome = self._mapper.take(taken.frame, timer)
         else:

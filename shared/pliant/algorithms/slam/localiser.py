@@ -30,7 +30,7 @@ from pliant.algorithms.slam.frame_mapper import FrameMapper
 from pliant.algorithms.slam.journal import Journal, Outcome
 from pliant.algorithms.slam.locate.landmark_search import LandmarkSearch
 from pliant.algorithms.slam.locate.localisation import Motion
-from pliant.algorithms.slam.locate.pose_quality import why_doubtful
+from pliant.algorithms.slam.locate.pose_quality import SETTLED_S, why_doubtful
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.algorithms.slam.map.landmarks import MAPPED, Landmarks
@@ -182,7 +182,7 @@ class Localiser(FrameMapper):
         """The pose by all reacquired landmarks, and its quality."""
         placed = reacquire_points(active, self._motion, frame, T_world_camera)
         interval_s = 0.0 if self._motion is None else self._motion.interval_s()
-        settled = frame.tracks.ages * interval_s >= self._parameters.support.settled_s
+        settled = frame.tracks.ages * interval_s >= SETTLED_S
         placed = with_support(active, placed, placed.frame.tracks.points_px[settled])
         judge_tracks(active, placed)
         return placed
@@ -194,7 +194,7 @@ class Localiser(FrameMapper):
         self._journal.add_pose(
             placed.frame.number, reference, placed.T_world_camera, support.inliers
         )
-        why = why_doubtful(support, self._parameters.support)
+        why = why_doubtful(support)
         return self._publish(TRACKING, why, support.inliers, has_activated=has_activated)
 
     def _publish(

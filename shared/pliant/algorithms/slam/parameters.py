@@ -40,15 +40,6 @@ class StartParameters(Parameters):
     min_points: int = Field(
         default=100, ge=30, description="Minimum landmarks of a start after its adjustment"
     )
-    max_median_error_px: float = Field(
-        default=1.0, gt=0.0, description="Maximum median reprojection error of a start, px"
-    )
-    epipolar_gate_px: float = Field(
-        default=1.0, gt=0.0, description="Maximum epipolar error of an inlier, px"
-    )
-    min_inlier_share: float = Field(
-        default=0.5, gt=0.0, le=1.0, description="Minimum inlier share of the shared tracks"
-    )
     keyframes: int = Field(
         default=6, ge=3, description="Keyframes, evenly spread over the frames of a start"
     )
@@ -60,19 +51,6 @@ class LocalisationParameters(Parameters):
     min_inliers: int = Field(default=30, ge=6, description="Minimum inliers of a pose")
     inlier_px: float = Field(
         default=1.5, gt=0.0, description="Maximum reprojection error of an inlier, px"
-    )
-    kernel_sigma_px: float = Field(
-        default=2.0, gt=0.0, description="Scale of the Geman-McClure kernel of the pose, px"
-    )
-    ransac_gate_px: float = Field(
-        default=4.0, gt=0.0, description="Maximum reprojection error of an inlier in P3P RANSAC, px"
-    )
-    ransac_samples: int = Field(default=100, ge=1, description="Samples of P3P RANSAC")
-    min_predicted_share: float = Field(
-        default=0.5,
-        ge=0.0,
-        le=1.0,
-        description="Inlier share below which the predicted pose is compared with RANSAC",
     )
     max_lost_s: float = Field(
         default=1.0, ge=0.0, description="Seconds without a pose before a new segment starts"
@@ -93,81 +71,6 @@ class ReacquisitionParameters(Parameters):
         le=1.0,
         description=(
             "Minimum ZNCC of the 8x8 patches, for reacquisition and for matches between places"
-        ),
-    )
-
-
-class RecoveryParameters(Parameters):
-    """How the camera is localised again after frames without a pose."""
-
-    points: int = Field(
-        default=400, ge=30, description="Landmarks that are searched far from their prediction"
-    )
-    radius_share: float = Field(
-        default=0.01,
-        gt=0.0,
-        description="Search radius immediately after a loss, share of the image width",
-    )
-    growth_share_per_s: float = Field(
-        default=0.3,
-        ge=0.0,
-        description="Growth of the radius per second without a pose, share of the image width",
-    )
-    max_radius_share: float = Field(
-        default=0.15, gt=0.0, le=1.0, description="Maximum search radius, share of the image width"
-    )
-    ransac_samples: int = Field(default=500, ge=1, description="Samples of P3P RANSAC")
-    min_agreeing: int = Field(
-        default=15,
-        ge=6,
-        description="Minimum inliers before a pose is verified",
-    )
-    min_support_share: float = Field(
-        default=0.015,
-        ge=0.0,
-        le=1.0,
-        description=(
-            "Minimum share of the landmarks in view that support a pose; wrong poses reach 1 %"
-        ),
-    )
-    min_agreement: float = Field(
-        default=0.6,
-        ge=0.0,
-        le=1.0,
-        description=(
-            "Minimum share of the matched landmarks that support the pose; wrong poses reach "
-            "half, because matches are near the projection"
-        ),
-    )
-
-
-class SupportParameters(Parameters):
-    """When a pose is published as doubtful."""
-
-    settled_s: float = Field(
-        default=0.5,
-        ge=0.0,
-        description="Age in seconds at which a track in enough keyframes should have a landmark",
-    )
-    max_contrary_share: float = Field(
-        default=0.12,
-        ge=0.0,
-        le=1.0,
-        description="Maximum share of the image whose motion contradicts the pose",
-    )
-    min_share: float = Field(
-        default=0.4,
-        ge=0.0,
-        le=1.0,
-        description="Minimum share of the visible landmarks that fit the pose",
-    )
-    min_spread: float = Field(
-        default=0.06,
-        ge=0.0,
-        le=1.0,
-        description=(
-            "Minimum standard deviation of the fitting landmarks, share of the image width or"
-            " height"
         ),
     )
 
@@ -334,8 +237,6 @@ class MappingParameters(Parameters):
     start: StartParameters = StartParameters()
     localisation: LocalisationParameters = LocalisationParameters()
     reacquisition: ReacquisitionParameters = ReacquisitionParameters()
-    recovery: RecoveryParameters = RecoveryParameters()
-    support: SupportParameters = SupportParameters()
     keyframe: KeyframeParameters = KeyframeParameters()
     window: WindowParameters = WindowParameters()
     whole_map: WholeMapParameters = WholeMapParameters()

@@ -33,7 +33,7 @@ _MOVED_SHARE = 0.1
 _SHARED = 0.5
 """And so does a smaller share of surfels in common with the last view."""
 _AGREEING = 15
-"""Minimum corners that agree on a motion, as for lost cameras (``RecoveryParameters``)."""
+"""Minimum corners that agree on a motion, as for lost cameras (``MIN_AGREEING``)."""
 _GATE_SHARE = 0.01
 """Share of the image's width: error of an agreeing corner.  Deforming scenes deviate from any rigid
 motion.

@@ -49,23 +49,32 @@ class FrameImages(NamedTuple):
 
 
 class StepLimits(NamedTuple):
-    """Limits of a step: see the fields of TrackingParameters.
+    """Limits of a step, in pixels of the octave.  Those without a default are parameters.
 
     interval_s: from the frame before to this one.
     """
 
-    prediction_weight: np.float32
-    prediction_sigma: np.float32
-    max_correction: np.float32
     min_curvature: np.float32
     min_zncc: np.float32
-    min_residual: np.float32
-    extremum_gate: np.float32
-    coast_gate: np.float32
-    backward_gate: np.float32
-    patch_iterations: int
     coast_s: np.float32
     interval_s: np.float32
+    prediction_weight: np.float32 = np.float32(1.0)
+    """lambda of Eq. 5 as a multiple of the track's own last kappa."""
+    prediction_sigma: np.float32 = np.float32(3.0)
+    """Scale of w in Eq. 5."""
+    max_correction: np.float32 = np.float32(5.0)
+    """Maximum distance between an extremum and its prediction."""
+    min_residual: np.float32 = np.float32(1.5)
+    """RMS residual, grey levels, below which min_zncc is not required."""
+    extremum_gate: np.float32 = np.float32(1.0)
+    """Maximum distance between a patch and its extremum; beyond, it coasts."""
+    coast_gate: np.float32 = np.float32(3.0)
+    """Maximum distance of a coasting patch from the flow."""
+    backward_gate: np.float32 = np.float32(0.7)
+    """Maximum distance between the start of a coasting patch with a strength of 1 DN^2 and its
+    position tracked backwards; it scales with one over the root of the strength, 0.25 to 1."""
+    patch_iterations: int = 4
+    """Maximum Gauss-Newton steps of a patch in a frame."""
 
 
 class _Place(NamedTuple):
@@ -89,7 +98,7 @@ def advance_tracks(
     templates: F32,
     scratch: F32,
 ) -> None:
-    """Move tracks on by one frame; ``alive`` says which survive.
+    """Move tracks by one frame; ``alive`` marks those that survive.
 
     kappa: curvature of this frame.  order: the rows, from ``scan_order``.  motions: (len(order), 2)
     and scratch: (TEMPLATE_FLOATS), both overwritten.

@@ -36,7 +36,7 @@ MAX_SLOPE = np.float32(0.12)
 MIN_TURN = np.float32(0.06)
 """Change of a deformation, per pixel, at which a template is renewed: 0.2 px at its rim."""
 MAX_GROWTH, MIN_GROWTH = np.float32(4.0), np.float32(0.4)
-"""Of the area, beyond which what was kept from the birth says too little."""
+"""Share of the area beyond which the template of the birth is of no use."""
 
 
 def slopes_of_motion(tracks: Tracks, affine: F32, height: int, width: int) -> F32:

@@ -1,8 +1,8 @@
 """The dominant flow between two frames (VITAMIN-E, section 2.2).
 
 BRIEF pairs (Calonder et al. 2010, without steering) on the image at a sixth of its size, or larger
-if that leaves too few rows for them, and an affine model y = A x + b fitted to them with the
-Geman-McClure kernel (Eq. 2-3).
+if that leaves too few rows.  An affine model y = A x + b is fitted to them with the Geman-McClure
+kernel (Eq. 2-3).
 """
 
 from dataclasses import dataclass

@@ -186,9 +186,9 @@ def _align_cells(
 def fit_planes(flow: F32, found: BoolArray, points: F32, tolerance: np.float32, slopes: F32) -> F32:
     """Move the flow of each cell from its patch to its centre, in agreement with its neighbours.
 
-    A plane is fitted to the flow of the 3x3 cells around, with Geman-McClure weights of their
-    distance from the cell's own flow, or from the median where the cell failed or stands alone:
-    so a zoom is interpolated, and a step in depth is not.  slopes: (rows, columns, 4) go there,
+    A plane is fitted to the flow of the surrounding 3x3 cells.  The Geman-McClure weights are of
+    the distance from the cell's own flow, or from the median if the cell failed or is isolated: so
+    a zoom is interpolated, and a step in depth is not.  slopes: (rows, columns, 4) go there,
     [du/dx, du/dy, dv/dx, dv/dy] of the planes; 0 where there is none.
     """
     agreed = flow.copy()

@@ -34,6 +34,15 @@ from pliant.algorithms.tracks import FrameExtrema
 MAX_BRIEF_DISTANCE_BITS = 64
 """Maximum distance of 256 bits: beyond, a pair is as likely wrong as right."""
 
+_FLOW_POINTS = 300
+"""Maximum BRIEF points for the dominant flow."""
+
+_FLOW_MAX_SHIFT_PX = 180.0
+"""Maximum displacement between matched BRIEF points."""
+
+_FLOW_SIGMA_PX = 6.0
+"""Scale of the Geman-McClure kernel of the affine fit (Eq. 3)."""
+
 _KAPPA_BITS = 8
 """Significant bits of a published kappa: of a cube of the contrast, sign and size matter."""
 
@@ -50,7 +59,7 @@ class ExtremaTracker:
         """Prepare for frames of one size.  seed: of the BRIEF comparisons."""
         self._parameters = parameters
         self._shape = (height, width)
-        self._brief = BriefExtractor(np.random.default_rng(seed), parameters.flow_points)
+        self._brief = BriefExtractor(np.random.default_rng(seed), _FLOW_POINTS)
         self._table = TrackTable.with_capacity(parameters.max_tracks)
         self._next_id = 0
         self._kappa = np.zeros(self._shape, np.float32)
@@ -125,12 +134,9 @@ class ExtremaTracker:
 
     def _flow_between(self, before: BriefFeatures, now: BriefFeatures) -> F64:
         sources, targets = match_features(
-            before,
-            now,
-            max_distance_bits=MAX_BRIEF_DISTANCE_BITS,
-            max_shift_px=self._parameters.flow_max_shift_px,
+            before, now, max_distance_bits=MAX_BRIEF_DISTANCE_BITS, max_shift_px=_FLOW_MAX_SHIFT_PX
         )
-        return fit_affine(sources, targets, sigma_px=self._parameters.flow_sigma_px)
+        return fit_affine(sources, targets, sigma_px=_FLOW_SIGMA_PX)
 
     def _local_flow(self, pyramid: list[F32], affine: F32) -> Flow:
         if not self._has_previous:
@@ -280,16 +286,8 @@ def _pyramid(image: F32) -> list[F32]:
 
 def _step_limits(p: TrackingParameters, interval_s: float) -> StepLimits:
     return StepLimits(
-        prediction_weight=np.float32(p.prediction_weight),
-        prediction_sigma=np.float32(p.prediction_sigma_px),
-        max_correction=np.float32(p.max_correction_px),
         min_curvature=np.float32(p.min_curvature),
         min_zncc=np.float32(p.min_zncc),
-        min_residual=np.float32(p.min_residual),
-        extremum_gate=np.float32(p.extremum_gate_px),
-        coast_gate=np.float32(p.coast_gate_px),
-        backward_gate=np.float32(p.backward_gate_px),
-        patch_iterations=p.patch_iterations,
         coast_s=np.float32(p.coast_s),
         interval_s=np.float32(interval_s),
     )
@@ -297,9 +295,5 @@ def _step_limits(p: TrackingParameters, interval_s: float) -> StepLimits:
 
 def _birth_limits(p: TrackingParameters) -> BirthLimits:
     return BirthLimits(
-        spacing=p.spacing_px,
-        cell=p.cell_px,
-        min_strength=np.float32(p.min_strength),
-        fine_strength=np.float32(p.fine_strength),
-        min_isotropy=np.float32(p.min_isotropy),
+        min_strength=np.float32(p.min_strength), fine_strength=np.float32(p.fine_strength)
     )

@@ -24,13 +24,17 @@ BINS = 2048
 
 
 class BirthLimits(NamedTuple):
-    """Where new tracks start: see the fields of TrackingParameters."""
+    """Where new tracks start.  Limits without a default are parameters."""
 
-    spacing: int
-    cell: int
     min_strength: np.float32
     fine_strength: np.float32
-    min_isotropy: np.float32
+    min_isotropy: np.float32 = np.float32(0.05)
+    """Minimum ratio of the eigenvalues of a new patch's structure tensor: a patch below it lies on
+    a contour and slides along it."""
+    spacing: int = 2
+    """Minimum distance of a new track to all others, px."""
+    cell: int = 40
+    """Side of the cells over which new tracks are spread evenly, px."""
 
 
 class _Birth(NamedTuple):

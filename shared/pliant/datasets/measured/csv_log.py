@@ -175,7 +175,7 @@ def in_m_s2(accel: F64, factor: float | None, where: Path | str) -> tuple[F64, s
     """Accelerations (N, 3) in m/s^2, and a note.  factor: that of their unit; None: unknown.
 
     At rest an accelerometer measures gravity, and a camera that is held by hand, by a car or by a
-    drone accelerates less than that most of the time.  Raises DatasetError where it is missing.
+    drone accelerates less than that most of the time.  Raises DatasetError if it is missing.
     """
     lengths = np.linalg.norm(accel[np.isfinite(accel).all(axis=1)], axis=1)
     median = float(np.median(lengths)) if len(lengths) else 0.0
@@ -192,7 +192,7 @@ def in_m_s2(accel: F64, factor: float | None, where: Path | str) -> tuple[F64, s
 
 
 def _columns(header: Sequence[str], file: Path) -> _Columns:
-    """Raises DatasetError where one is missing."""
+    """Raises DatasetError if one is missing."""
     gyro, accel = _triple(header, _GYRO), _triple(header, _ACCEL)
     time, unit = time_column(header)
     what = [

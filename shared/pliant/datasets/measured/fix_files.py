@@ -66,7 +66,7 @@ def read_gpx(file: Path) -> Measurements:
 def read_srt(file: Path) -> Measurements:
     """The fixes in the subtitles of a video, each once; nothing in those of other cameras.
 
-    Raises DatasetError where it cannot be read.
+    Raises DatasetError if it cannot be read.
     """
     stamps, values, stamp = list[int](), list[list[float]](), -1
     before: list[float] = []

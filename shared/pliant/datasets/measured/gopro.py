@@ -14,9 +14,9 @@ _MOST_BYTES = 1 << 22
 
 
 def read_gopro(file: Path) -> Measurements:
-    """The samples of a video, from its first picture on; nothing where it has none.
+    """The samples of a video, from its first picture on; nothing if it has none.
 
-    Raises DatasetError where it cannot be read.
+    Raises DatasetError if it cannot be read.
     """
     payloads = list(_payloads(file))
     return read_gpmf(payloads, f"{file.name} (GPMF)") if payloads else NOTHING

@@ -36,20 +36,20 @@ def read_gcsv(file: Path) -> Measurements:
     missing = [name for name in _COLUMNS if name not in header]
     if missing:
         raise DatasetError(f"{file}: without the columns {', '.join(missing)}")
-    said = {row[0].strip(): row[1].strip() for row in rows[1:begin] if len(row) > 1}
-    scales = [_scale(said, key, file) for key in ("tscale", "gscale", "ascale")]
+    settings = {row[0].strip(): row[1].strip() for row in rows[1:begin] if len(row) > 1}
+    scales = [_scale(settings, key, file) for key in ("tscale", "gscale", "ascale")]
     wanted = [header.index(name) for name in _COLUMNS[1:]]
     times, table, unreadable = numbers(rows[begin + 1 :], header.index("t"), wanted)
     stamps = np.clip(np.array(times, float) * scales[0] * 1e9, -(2.0**62), 2.0**62)
-    turn = axis_order(said.get("orientation", "XYZ")).T
+    turn = axis_order(settings.get("orientation", "XYZ")).T
     gyro = Series(np.rint(stamps).astype(np.int64), table[:, :3] @ turn * scales[1])
     accel, _ = in_m_s2(table[:, 3:] @ turn, scales[2] * STANDARD_GRAVITY_M_S2, file)
     return imu_measurements(gyro, Series(gyro.stamps_ns, accel), file.name, unreadable=unreadable)
 
 
-def _scale(said: dict[str, str], key: str, file: Path) -> float:
+def _scale(settings: dict[str, str], key: str, file: Path) -> float:
     try:
-        scale = float(said.get(key, "1"))
+        scale = float(settings.get(key, "1"))
     except ValueError:
         scale = 0.0
     if not 0.0 < scale < _LARGEST:

@@ -31,7 +31,7 @@ _NO_FIX = -1
 def sensors_of(file: MessageFile, spec: SourceSpec) -> Measurements:
     """Samples from the sensor topics that are named, or the only ones of their kind.
 
-    Raises DatasetError where a topic is named that is not there, or the choice is not clear.
+    Raises DatasetError if a topic is named that is not there, or the choice is not clear.
     """
     with file.open() as opened:
         imu, fixes = sensor_topics(opened, spec, file)

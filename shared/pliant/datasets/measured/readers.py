@@ -51,7 +51,7 @@ def read_named(file: Path, readers: Mapping[str, Reader], option: str) -> Measur
 def video_sensors(spec: SourceSpec) -> Measurements:
     """The samples inside a video, and in files of its name beside it.
 
-    Raises DatasetError where the video cannot be read.
+    Raises DatasetError if the video cannot be read.
     """
     file = Path(spec.location)
     found = read_gopro(file)

@@ -18,16 +18,16 @@ class Line:
 
 
 def chart(
-    lines: Sequence[Line], *, span: tuple[float, float], top: float, says: tuple[str, str, str],
+    lines: Sequence[Line], *, span: tuple[float, float], top: float, labels: tuple[str, str, str],
     shaded: Sequence[float] = (),
 ) -> str:  # fmt: skip
     """An <svg>: one polyline for each line, thinned to what a screen shows.
 
     span: first and last place.   top: the value at the upper edge.   shaded: places of width 1.
-    says: what is drawn, the text at the upper edge, and that at the right end of the axis.
+    labels: what is drawn, the text at the upper edge, and that at the right end of the axis.
     """
     across = (_RIGHT - _LEFT) / max(span[1] - span[0], 1e-9)
-    of, highest, end = says
+    of, highest, end = labels
 
     def polyline(line: Line) -> str:
         step = max(1, len(line.places) // _WIDTH)

@@ -18,7 +18,7 @@ _TRUTH = "<!-- against the truth -->"
 def fill_page(path: Path, report: dict[str, Any], names: Container[str], **parts: str) -> None:
     """Write a page.  names: of the files beside it.  parts: HTML by its place in page.html.
 
-    Raises ResultError where the disk fails.
+    Raises ResultError if the disk fails.
     """
     text = Template(_part("page.html")).substitute(
         title=escape(report["source"] or "a run"),
@@ -63,9 +63,9 @@ def ended(report: dict[str, Any]) -> list[tuple[str, str]]:
     return [("ended early", report["ended_early"])] if report["ended_early"] else []
 
 
-def table_rows(told: Iterable[tuple[str, str]]) -> str:
+def table_rows(rows: Iterable[tuple[str, str]]) -> str:
     """Rows of a <table>: names and values."""
-    return "".join(f"<tr><th>{escape(a)}</th><td>{escape(b)}</td></tr>" for a, b in told)
+    return "".join(f"<tr><th>{escape(a)}</th><td>{escape(b)}</td></tr>" for a, b in rows)
 
 
 def canvas(scene: Scene) -> str:
@@ -80,11 +80,11 @@ def canvas(scene: Scene) -> str:
     )
 
 
-def bullets(heading: str, told: list[str]) -> str:
+def bullets(heading: str, sentences: list[str]) -> str:
     """A section of sentences; "" without any."""
-    if not told:
+    if not sentences:
         return ""
-    lines = "".join(f"<li>{escape(line)}</li>" for line in told)
+    lines = "".join(f"<li>{escape(line)}</li>" for line in sentences)
     return f"<h2>{heading}</h2><ul>{lines}</ul>"
 
 

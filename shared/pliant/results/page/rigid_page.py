@@ -94,11 +94,11 @@ def clip_of_keyframes(run: Run, recording: Recording) -> str:
     except ResultError:  # an OpenCV without animations
         _, encoded = cv2.imencode(".jpg", pictures[len(pictures) // 2][..., ::-1])
         kind, data = "jpeg", encoded.tobytes()
-    told = "Keyframes with their map points: near ones red, far ones blue."
+    caption = "Keyframes with their map points: near ones red, far ones blue."
     source = f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
     return (
         '<section><h2>Camera images</h2><figure><img alt="Keyframes with the points of the '
-        f'map" src="{source}"><figcaption>{told}</figcaption></figure></section>'
+        f'map" src="{source}"><figcaption>{caption}</figcaption></figure></section>'
     )
 
 
@@ -198,7 +198,7 @@ def _chart(run: Run, report: dict[str, Any], final: dict[int, tuple[int, F64]]) 
         [Line(frames, tracks, BLUE), Line(sorted(run.inliers), inliers, ORANGE)],
         span=(frames[0], frames[-1]),
         top=most,
-        says=("tracks and inliers", f"{most:,}", f"{seconds:.1f} s"),
+        labels=("tracks and inliers", f"{most:,}", f"{seconds:.1f} s"),
         shaded=[frame for frame in frames if frame not in final],
     )
     return (

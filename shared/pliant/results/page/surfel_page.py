@@ -64,7 +64,7 @@ def _surfel_chart(report: dict[str, Any]) -> str:
         [Line(frames, listed, BLUE), Line(frames, alive, ORANGE)],
         span=(0.0, frames[-1]),
         top=most,
-        says=("surfels", f"{most:,}", counted(len(frames), "frame")),
+        labels=("surfels", f"{most:,}", counted(len(frames), "frame")),
         shaded=report["frames_lost"],
     )
     return (

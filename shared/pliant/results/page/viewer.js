@@ -1,6 +1,6 @@
 "use strict";
 // A cloud of points, a mesh and a path that can be turned.  The data is one block of bytes:
-// positions are 16-bit shares of a box, as many as the header says.
+// positions are 16-bit shares of a box, their number is in the header.
 const header = JSON.parse(document.getElementById("scene").textContent);
 const text = atob(document.getElementById("bytes").textContent.trim());
 const bytes = Uint8Array.from(text, (letter) => letter.charCodeAt(0)).buffer;

@@ -337,10 +337,10 @@ class ActiveMap:
         """
         self.segment.to_global_shutter(self.keyframes, calibration)
         self.segment.ordinary.forget()
-        self.window.see_anew()
+        self.window.observe_again()
         self._adjust_window()
 
-    def see_anew(self, seen_by: SelfCalibration) -> None:
+    def use_calibration(self, seen_by: SelfCalibration) -> None:
         """Use another calibration, in whose pixels the keyframes already are."""
         self.seen_by, before = seen_by, self.window
         self.window = self._window(before.keyframes, fixed=before.fixed, outside=before.outside)

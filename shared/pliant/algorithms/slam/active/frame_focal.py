@@ -1,10 +1,10 @@
 """The focal length of each frame, if it changes during a clip (see ``changing_focal``).
 
-A frame that is magnified relative to the map by far more than one step of the camera explains,
-after one that was magnified half as much, shows the change long before an adjustment of all
-keyframes would be due.  One frame alone is not enough: a rolling shutter magnifies and reduces the
-frames of a shaking hand in turn.  After a change is found, each frame gets the focal length that
-fits its tracks, with a random walk from that of the frame before as its prior.
+The magnification of a frame relative to the map shows the change long before an adjustment of all
+keyframes is due.  It must be far more than one step of the camera explains, and at least half as
+large in the frame before.  One frame alone is not enough: a rolling shutter magnifies and reduces
+the frames of a shaking hand in turn.  After a change is found, each frame gets the focal length
+that fits its tracks, with a random walk from that of the frame before as its prior.
 """
 
 from dataclasses import replace

@@ -22,13 +22,15 @@ from pliant.algorithms.slam.locate.inverse_depth import (
     placed_candidates,
     spread_of,
 )
+from pliant.algorithms.slam.locate.landmark_search import MIN_AGREEMENT
 from pliant.algorithms.slam.locate.localisation import (
+    KERNEL_SIGMA_PX,
     Localisation,
     Motion,
     locate,
     refine,
 )
-from pliant.algorithms.slam.locate.pose_quality import support_of
+from pliant.algorithms.slam.locate.pose_quality import SETTLED_S, support_of
 from pliant.algorithms.slam.locate.reacquisition import reacquire
 from pliant.algorithms.slam.map.keyframe import Observations
 from pliant.algorithms.slam.map.landmarks import MAPPED
@@ -74,7 +76,7 @@ def locate_in_map(
     """Return T_world_camera of a frame, and the place if its image shows another one than its
     tracks.
 
-    active, motion: None where the camera is not in the map yet.   recognise: the place by the
+    active, motion: None if the camera is not in the map yet.   recognise: the place by the
     image.   Firm tracks need no image; the pose of a few counts if the image shows no other place.
     """
     there = None
@@ -141,7 +143,7 @@ def localise(
             if not frame.has_image or inliers >= _FEW * before:
                 return Located(located.T_world_camera, inliers >= _FIRM * before)
             proved = active.search_in(frame, generator).verify(
-                located.T_world_camera, active.nearby(), parameters.recovery.min_agreement
+                located.T_world_camera, active.nearby(), MIN_AGREEMENT
             )
             if proved is not None:
                 return Located(proved.T_world_camera, True)
@@ -235,8 +237,7 @@ def rotation_by_image(active: ActiveMap, placed: PlacedFrame) -> tuple[F64, floa
     rows, points_px = active.observed(placed, candidates)
     some = np.arange(0, len(rows), max(1, len(rows) // _DECIDING))
     seen = _correspondences(active, NO_PRIOR, rows[some], points_px[some], len(candidates))
-    limits = active.parameters.localisation
-    bundle = BundleParameters(kernel_sigma_px=limits.kernel_sigma_px)
+    bundle = BundleParameters(kernel_sigma_px=KERNEL_SIGMA_PX)
     found = refine_pose(placed.T_world_camera, seen, active.camera, bundle)
     H = found.information
     # Without any points nothing is known: the inverse is as large as numbers allow.
@@ -299,7 +300,7 @@ def _settled(active: ActiveMap, motion: Motion, tracks: FrameTracks) -> BoolArra
     rows = active.links.rows
     newest = active.keyframes[-1].id
     seen_by = np.where(rows != UNLINKED, newest + 1 - points.first_keyframe[rows], 0)
-    old = tracks.ages * motion.interval_s() >= parameters.support.settled_s
+    old = tracks.ages * motion.interval_s() >= SETTLED_S
     return old & (seen_by >= parameters.point.min_observations)
 
 

@@ -73,7 +73,7 @@ def carried_poses(
 
 
 def _difference(turn: GyroTurn, before: F64, after: F64) -> F64 | None:
-    """(3,) from the gyro's turn between two poses (4, 4) to theirs; None where they disagree."""
+    """(3,) from the gyro's turn between two poses (4, 4) to theirs; None if they disagree."""
     off = so3_log(turn.R.T @ before[:3, :3].T @ after[:3, :3])
     covariance = turn.covariance + _POSE_RAD**2 * np.eye(3)
     agrees = off @ np.linalg.solve(covariance, off) < _CONTRADICTION**2

@@ -3,8 +3,8 @@ merged.
 
 Place recognition verifies that two keyframes see the same place, and the similarity between the
 world as each of them maps it.  A pose graph of similarities distributes the drift over all
-keyframes between them, landmarks move with their reference keyframes, common ones are merged, and
-the next global bundle adjustment refines the result.
+keyframes between them.  Landmarks move with their reference keyframes, and duplicates are merged.
+The next global bundle adjustment refines the result.
 """
 
 from typing import NamedTuple
@@ -101,7 +101,7 @@ def _edges(
     enough[following, following - 1] = follow
     jumps = following[~follow]
     if len(jumps):
-        # A recognised camera keeps its place, whatever a loop says.
+        # A recognised camera keeps its place, whatever a loop implies.
         before = np.where(np.arange(M) < jumps[:, None], shared[jumps], 0)
         best = before.argmax(axis=1)
         enough[jumps, best] |= before.max(axis=1) >= _FOLLOWING_SHARE * np.minimum(

@@ -20,6 +20,7 @@ from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.estimate.focal_pose import refine_focal, thinning
 from pliant.algorithms.slam.estimate.pose import Correspondences, refine_pose
 from pliant.algorithms.slam.estimate.trajectory_smoothing import smooth_trajectory
+from pliant.algorithms.slam.locate.localisation import MIN_PREDICTED_SHARE
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.algorithms.slam.map.landmarks import MAPPED, MAPPED_SHARE, Landmarks
 from pliant.algorithms.slam.parameters import MappingParameters
@@ -189,7 +190,7 @@ def refined_poses(
         seen = Correspondences(xyz, points_px, seen_by.weights(points_px))
         found = refine_pose(start, seen, camera, parameters.bundle, inlier_px=limits.inlier_px)
         inliers = int(np.count_nonzero(found.inliers))
-        if inliers >= max(limits.min_inliers, limits.min_predicted_share * len(xyz)):
+        if inliers >= max(limits.min_inliers, MIN_PREDICTED_SHARE * len(xyz)):
             placed.append(
                 RefinedPose(
                     frame=each.frame, keyframe=keyframe, T_world_camera=found.T_world_camera,

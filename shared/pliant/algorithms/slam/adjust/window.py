@@ -84,7 +84,7 @@ class Window:
             rows, points_px, weights, self.columns, slot, self.u, self.v, self.w, self.seen
         )  # fmt: skip
 
-    def see_anew(self) -> None:
+    def observe_again(self) -> None:
         """The keyframes have other pixels than when the window was made."""
         for slot, keyframe in enumerate(self.keyframes):
             self._observe(slot, keyframe.rows, keyframe.points_px)

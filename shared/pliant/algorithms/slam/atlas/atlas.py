@@ -145,7 +145,7 @@ class Atlas:
         search = LandmarkSearch(self.points, maxima, grey, view.camera, self._parameters, generator)
         return self.places.recognise(search, segments, view)
 
-    def go_on(self, seen: Keyframe, ids: I64) -> None:
+    def resume(self, seen: Keyframe, ids: I64) -> None:
         """Continue the segment of a recognised keyframe at its place.
 
         ids: of the tracks.
@@ -272,7 +272,7 @@ class Atlas:
         newest = active.keyframes[-1]
         pose = newest.T_world_camera
         see_by(active.segment, before.view, self.calibration, refocus)
-        active.see_anew(self.calibration)
+        active.use_calibration(self.calibration)
         self._earlier.see_by(before, self.calibration)
         self._adjusted = True  # readers have the landmarks of the previous calibration
         return Moved(newest.T_world_camera @ inverse(pose))

@@ -129,7 +129,7 @@ class LoopCandidates:
         generator = np.random.default_rng(keyframe.id)
         least, found_loops = parameters.localisation.min_inliers, list[Loop]()
 
-        def ask(some: Iterable[Place]) -> None:
+        def match_with(some: Iterable[Place]) -> None:
             for old in some:
                 found = match_places(old, new, points, camera, parameters, generator)
                 comparisons.compared += 1
@@ -140,7 +140,7 @@ class LoopCandidates:
                 ids = points.ids[rows]
                 found_loops.append(Loop(old.keyframe.id, keyframe.id, S_old_new, rows, ids))
 
-        ask(
+        match_with(
             islice(
                 (
                     old
@@ -151,7 +151,7 @@ class LoopCandidates:
             )
         )
         if found_loops:
-            ask(elsewhere)
+            match_with(elsewhere)
         loop = max(found_loops, key=lambda each: len(each.rows), default=None)
         if loop is None or not all(_agree(each, loop, new, points) for each in found_loops):
             comparisons.contradicted += len(found_loops)

@@ -2,12 +2,12 @@
 
 A calibration of the whole image, used for a part that was cropped off centre, bends the map while
 the residuals hardly grow.  So does one for square pixels after video was resized to another shape.
-So the adjustment of all keyframes tests, for each of the two, by how much one linear step with it
-free would reduce the cost (a score test), in units of the variance of the residuals.  All other
-unknowns are free in both cases, so that neither explains the error of the other.  If the gain is
-far beyond noise and errors of the lens model, it becomes an unknown.  Otherwise it is fixed,
-because a map is more accurate with a correct one fixed.  Translation alone shows no aspect ratio:
-it only stretches the map.
+So the adjustment of all keyframes runs a score test for each of the two.  It computes by how much
+one linear step with this unknown free would reduce the cost, in units of the variance of the
+residuals.  All other unknowns are free in both cases, so that neither explains the error of the
+other.  If the gain is far beyond noise and errors of the lens model, it becomes an unknown.
+Otherwise it is fixed, because a map is more accurate with a correct one fixed.  Translation alone
+shows no aspect ratio: it only stretches the map.
 """
 
 from typing import NamedTuple

@@ -86,9 +86,9 @@ def relative_poses(points_a: F64, points_b: F64, *, gate: float) -> list[Relativ
     """Motions that may explain two views: several, because noise and planes allow more than
     one, and only further views decide.
 
-    The essential matrix by two estimators that improve each sample on all points that agree with it
-    (with the few points of a sample alone the noise decides), and the motions that a homography
-    allows (Ma et al. 2004, section 5.3): of a plane there are two.
+    The essential matrix by two estimators, and the motions that a homography allows.  Both
+    estimators improve each sample on all points that agree with it, because the noise dominates in
+    the few points of a sample (Ma et al. 2004, section 5.3): of a plane there are two.
 
     points_a, points_b: (N, 2), the same points on the plane z = 1 of each view.  ``gate`` is the
     largest epipolar error of an inlier.  OpenCV seeds its samples itself at every call, so the
@@ -106,7 +106,7 @@ def relative_poses(points_a: F64, points_b: F64, *, gate: float) -> list[Relativ
 
 
 def likely_pose(points_a: F64, points_b: F64, *, gate: float) -> RelativePose | None:
-    """One of ``relative_poses``, in a tenth of the time and not always the best; None where there
+    """One of ``relative_poses``, in a tenth of the time and not always the best; None if there
     is none."""
     if len(points_a) < 8:
         return None

@@ -101,8 +101,9 @@ def seen_in_state(rows: I32, state: U8, wanted: int, seen: BoolArray, slot: int,
 def flows(
     rows: I32, state: U8, least: int, u: F32, v: F32, seen: BoolArray, H: F64
 ) -> tuple[int, F32]:
-    """Number of points in at least the given state that the second last slot sees, and the motions,
-    px, of those that the last one also sees, without the rotation H (3, 3) of its pixels.
+    """Return the number of points in at least the given state in the second last slot.  Also return
+    the motions, px, of those that the last slot sees, too, without the rotation H (3, 3) of its
+    pixels.
     """
     moved = np.empty(rows.size, np.float32)
     before, both = 0, 0

@@ -21,7 +21,7 @@ from pliant.algorithms.slam.estimate.pose_prior import (
     add_prior,
     shifted_motion,
 )
-from pliant.algorithms.slam.estimate.problem import BundleParameters
+from pliant.algorithms.slam.estimate.problem import INITIAL_DAMPING, BundleParameters
 from pliant.algorithms.slam.estimate.projection import (
     Cameras,
     Limits,
@@ -47,7 +47,7 @@ class Spread(NamedTuple):
 
 
 class Correspondences(NamedTuple):
-    """Points and their observations in one image, and whatever else tells the pose of its camera.
+    """Points and their observations in one image, and any prior on the pose of its camera.
 
     points_world: (N, 3).   points_px: (N, 2), NaN where not seen.   weights: (N,) of the
     observations; None: all alike.   spread: of points with an uncertain depth, see
@@ -99,7 +99,7 @@ def refine_pose(
     shared, cost = _minimise(
         pose, layout.cameras.single(), layout.points.astype(np.float32), layout.table,
         tuple(each.astype(np.float32) for each in depths), limits_of(parameters, np.float32),
-        mean, seen.prior.information, parameters.initial_damping,
+        mean, seen.prior.information, INITIAL_DAMPING,
         parameters.min_relative_decrease, iterations, normal,
     )  # fmt: skip
     squared = squared_residuals(layout, pose[None], layout.points, parameters, depths, shared)

@@ -1,4 +1,4 @@
-"""A prior on the pose of a camera, for whoever estimates that pose.
+"""A prior on the pose of a camera, for the solvers of a pose.
 
 With R, t of the camera, R_0, t_0 of the mean and E = R R_0^T, the cost is d^T L d, where
 

@@ -17,6 +17,9 @@ from pliant.algorithms.parameters import Parameters
 SHARED = 7
 """Unknowns of a calibration that all cameras share: see ``calibration``."""
 
+INITIAL_DAMPING = 1e-4
+"""Of Levenberg-Marquardt, relative to the diagonal of the Hessian."""
+
 
 class BundleParameters(Parameters):
     """Parameters shared by all bundle adjustment solvers."""
@@ -45,16 +48,6 @@ class BundleParameters(Parameters):
         default=1e-5,
         ge=0.0,
         description="Stop when an iteration or a sweep reduces the cost by less than this share",
-    )
-    initial_damping: float = Field(
-        default=1e-4,
-        gt=0.0,
-        description="Initial Levenberg-Marquardt damping, relative to the diagonal of the Hessian",
-    )
-    sweep_damping: float = Field(
-        default=1e-3,
-        ge=0.0,
-        description="Damping of a subspace block, relative to the diagonal of the block",
     )
 
 

@@ -191,7 +191,7 @@ def solve_reduced(pattern: Pattern, S: F64, b: F64, damping: F64) -> F64 | None:
 
 
 def factor_reduced(pattern: Pattern, S: F64, damping: F64) -> bool:
-    """Overwrite S with the L of ``S + diag(damping)``; False where that is not positive definite.
+    """Overwrite S with the L of ``S + diag(damping)``; False if that is not positive definite.
 
     As of ``solve_reduced``.
     """
@@ -202,7 +202,7 @@ def factor_reduced(pattern: Pattern, S: F64, damping: F64) -> bool:
 
 
 def substitute_reduced(pattern: Pattern, L: F64, b: F64) -> F64 | None:
-    """Solve ``L L^T x = b``: (N, n), None where that is not finite."""
+    """Solve ``L L^T x = b``: (N, n), None if that is not finite."""
     x = b.copy()
     _substitute(pattern.start, pattern.row, L, x, (0,) * b.shape[1])
     return x if np.isfinite(x).all() else None
@@ -210,7 +210,7 @@ def substitute_reduced(pattern: Pattern, L: F64, b: F64) -> F64 | None:
 
 @fast_kernel
 def _factor(start: I64, row: I32, block: I32, S: F64, unknowns: Any) -> bool:
-    """Overwrite S with L: its blocks below the diagonal by columns; False where it has none.
+    """Overwrite S with L: its blocks below the diagonal by columns; False if it has none.
 
     unknowns: n of any numbers: their count is known when numba compiles.
     """

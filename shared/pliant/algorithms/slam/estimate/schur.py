@@ -32,6 +32,7 @@ from pliant.algorithms.slam.estimate.packed_layout import (
     build_packed_layout,
 )
 from pliant.algorithms.slam.estimate.problem import (
+    INITIAL_DAMPING,
     SHARED,
     AnyProblem,
     BundleParameters,
@@ -167,7 +168,7 @@ def _iterate(
     """Iterate until the cost converges: (state, cost curve, converged)."""
     state = system.start()
     costs = [state.cost]
-    damping, growth = parameters.initial_damping, 2.0
+    damping, growth = INITIAL_DAMPING, 2.0
     for _ in range(parameters.max_iterations):
         trial = system.step(state, damping, doubled)
         decrease = -np.inf if trial is None else state.cost - trial.cost

@@ -46,6 +46,9 @@ from pliant.algorithms.slam.estimate.projection import (
 from pliant.algorithms.slam.estimate.subspace_kernels import sweep_cameras, sweep_points
 from pliant.compiler.kernel import fast_kernel
 
+_DAMPING = 1e-3
+"""Of a block, relative to its diagonal."""
+
 
 def solve_subspace(
     problem: BundleWindow,
@@ -64,7 +67,7 @@ def solve_subspace(
     layout = build_layout(problem)
     motion, points = layout.cameras.motion.copy(), layout.points.copy()
     cameras, points32 = layout.cameras.single(), points.astype(np.float32)
-    limits, damping = limits_of(parameters, np.float32), np.float32(parameters.sweep_damping)
+    limits, damping = limits_of(parameters, np.float32), np.float32(_DAMPING)
     mean, L = shifted_motion(prior.T_world_camera, layout.origin), prior.information
     costs: list[float] = []
     converged = False
@@ -75,8 +78,7 @@ def solve_subspace(
         if not costs:
             costs.append(before)
         cost = after - sweep_cameras(
-            motion, cameras, layout.free, points32, layout.table, limits,
-            parameters.sweep_damping, mean, L,
+            motion, cameras, layout.free, points32, layout.table, limits, _DAMPING, mean, L
         )  # fmt: skip
         costs.append(cost)
         if on_iteration is not None:

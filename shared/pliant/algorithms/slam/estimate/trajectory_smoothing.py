@@ -9,13 +9,14 @@ Estimation for Robotics, section 11.1): with T = T_camera_world, xi the (6,) cor
     xi' = Ad(D) xi + dt w - log(D) + n,   w' = w + m,   D = T' T^-1,
     cov(n, m) = diag(q) kron [[dt^3/3, dt^2/2], [dt^2/2, dt]],
 
-where q has one value for translation and one for rotation.  The map says xi = 0 with the covariance
-``s^2 H^-1`` (H: information of the pose for a noise of one pixel).  The variance s^2 and both q
-maximise the likelihood of the poses (prediction errors of a Kalman filter), so that poses without
-an error of their own stay where they are.  Both noises have heavy tails: residuals of frames and of
-steps are weighted as those of a Student-t distribution, or a sudden turn would be rounded off and
-one bad pose would move its neighbours.  All is linear in xi, which is small: one pass of filter and
-smoother (Bryson and Frazier's form, which inverts 6 x 6 matrices alone) is exact.
+where q has one value for translation and one for rotation.  The map measures xi = 0 with the
+covariance ``s^2 H^-1`` (H: information of the pose for a noise of one pixel).  The variance s^2 and
+both q maximise the likelihood of the poses (prediction errors of a Kalman filter).  So poses
+without an error of their own stay unchanged.  Both noises have heavy tails: residuals of frames and
+of steps are weighted as those of a Student-t distribution.  Otherwise a sudden turn would be
+rounded off, and one bad pose would move its neighbours.  All is linear in xi, which is small: one
+pass of filter and smoother (Bryson and Frazier's form, which inverts 6 x 6 matrices alone) is
+exact.
 """
 
 import numpy as np
@@ -59,8 +60,8 @@ def smooth_trajectory(
     make their motion smooth.  A trajectory is split where a pose would contradict its own
     observations, as at a cut.
     """
-    told = np.diagonal(information, axis1=1, axis2=2)
-    known = np.isfinite(information).all(axis=(1, 2)) & (told > 0.0).all(axis=1)
+    diagonals = np.diagonal(information, axis1=1, axis2=2)
+    known = np.isfinite(information).all(axis=(1, 2)) & (diagonals > 0.0).all(axis=1)
     smoothed, runs = T_world_camera.copy(), [np.flatnonzero(known)]
     while runs:
         run = runs.pop()

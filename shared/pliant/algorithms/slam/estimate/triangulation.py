@@ -48,9 +48,10 @@ def spread_of_rays(
 ) -> tuple[F32, F32]:
     """Parallax and depth uncertainty of points that several cameras see.
 
-    xyz: (C, 3) of the points in ``columns`` (C,).  Returns the largest angle between two of the
-    rays (C,) in radians, found from the first ray's farthest, and the standard deviation along the
-    first ray as a share of the depth (C,), for observations with a noise of 1 px.
+    xyz: (C, 3) of the points in ``columns`` (C,).  Returns two arrays (C,).  The first is the
+    largest angle between two rays in radians, starting with the ray farthest from the first.  The
+    second is the standard deviation along the first ray as a share of the depth, for a noise of 1
+    px.
     """
     parallax, sigmas = np.empty(len(columns), np.float32), np.empty(len(columns), np.float32)
     centres = np.ascontiguousarray(T_world_camera[:, :3, 3])

@@ -16,9 +16,9 @@ turned, and the more the farther it went.  With 1 px of noise, the unknown depth
 
     r ~ N(0, I + e e^T),    W = (I + e e^T)^-1 = I - e e^T / (1 + e^T e)
 
-weighs the residual r.  So the observation tells the rotation in full, and the translation in full
-across the ray's epipolar line and along it only as far as the depth is known.  A point of the map
-has spread 0 and W = I.
+weighs the residual r.  So the observation constrains the rotation, and the translation across the
+epipolar line of the ray, in full.  It constrains the translation along that line only as far as
+the depth is known.  A point of the map has spread 0 and W = I.
 
 What is not mapped may all be nearer or farther than what is, so that depths err together, too: a
 frame sees candidates at X + s spread, with one s ~ N(0, 1) that is found with its pose.  Thousands

@@ -17,7 +17,32 @@ from pliant.algorithms.slam.estimate.pose import Correspondences
 from pliant.algorithms.slam.locate.localisation import Motion, locate, refine
 from pliant.algorithms.slam.locate.reacquisition import MaximaGrid, match_widely, reacquire
 from pliant.algorithms.slam.map.landmarks import Landmarks
-from pliant.algorithms.slam.parameters import MappingParameters, RecoveryParameters
+from pliant.algorithms.slam.parameters import MappingParameters
+
+RANSAC_SAMPLES = 500
+"""Samples of P3P and RANSAC without a track."""
+
+MAX_RADIUS_SHARE = 0.15
+"""Maximum search radius, share of the image width."""
+
+_RADIUS_SHARE = 0.01
+"""Search radius immediately after a loss, share of the image width."""
+
+_GROWTH_SHARE_PER_S = 0.3
+"""Growth of the radius per second without a pose, share of the image width."""
+
+_POINTS = 400
+"""Landmarks that are searched far from their prediction."""
+
+MIN_AGREEING = 15
+"""Minimum inliers before a pose is verified."""
+
+_MIN_SUPPORT_SHARE = 0.015
+"""Minimum share of the landmarks in view that support a pose; wrong poses reach 1 %."""
+
+MIN_AGREEMENT = 0.6
+"""Minimum share of the matched landmarks that support the pose; wrong poses reach half, because
+matches are near the projection."""
 
 NEAR = 0.3
 """Share of the radius that is searched first: usually sufficient, with far fewer false matches."""
@@ -52,7 +77,7 @@ class LandmarkSearch(NamedTuple):
         """
         predictions = motion.predictions(stamp_ns)
         lost_s = motion.lost_s(stamp_ns)
-        radius_px = search_radius_px(lost_s, self.camera, self.parameters.recovery)
+        radius_px = search_radius_px(lost_s, self.camera)
         for radius in (NEAR * radius_px, radius_px):
             for prediction in predictions:
                 proved = self.near(prediction, rows, radius)
@@ -65,28 +90,27 @@ class LandmarkSearch(NamedTuple):
 
         rows: of the landmarks.
         """
-        camera, own = self.camera, self.parameters.recovery
-        limits = self.parameters.localisation.model_copy(
-            update={"ransac_samples": own.ransac_samples}
-        )
+        camera, limits = self.camera, self.parameters.localisation
         grid = MaximaGrid.build(self.maxima, camera.width, camera.height, radius_px)
         found, points_px = match_widely(
-            T_world_camera, rows, self.points, grid, self.grey, camera, radius_px, own.points,
+            T_world_camera, rows, self.points, grid, self.grey, camera, radius_px, _POINTS,
             self.parameters.reacquisition.min_zncc,
         )  # fmt: skip
-        if len(found) < own.min_agreeing:
+        if len(found) < MIN_AGREEING:
             return None
         seen = Correspondences(self.points.xyz[found], points_px)
-        located = locate([T_world_camera], seen, camera, limits, self.generator)
-        if located.inliers.sum() < own.min_agreeing:
+        located = locate(
+            [T_world_camera], seen, camera, limits, self.generator, samples=RANSAC_SAMPLES
+        )
+        if located.inliers.sum() < MIN_AGREEING:
             return None
-        return self.verify(located.T_world_camera, rows, own.min_agreement)
+        return self.verify(located.T_world_camera, rows, MIN_AGREEMENT)
 
     def verify(self, T_world_camera: F64, rows: I32, min_agreement: float) -> VerifiedPose | None:
         """Refine a pose by all landmarks found at their projection; None if too few support it.
 
         min_agreement: minimum share of the found landmarks that support it, see
-        ``RecoveryParameters``.  A wrong pose finds landmarks too: wherever a maximum is near and
+        ``MIN_AGREEMENT``.  A wrong pose finds landmarks too: wherever a maximum is near and
         its patch looks alike.
         """
         limits = self.parameters.localisation
@@ -100,7 +124,7 @@ class LandmarkSearch(NamedTuple):
         located = refine(T_world_camera, seen, self.camera, limits, near=True)
         enough = max(
             limits.min_inliers,
-            self.parameters.recovery.min_support_share * len(found.visible),
+            _MIN_SUPPORT_SHARE * len(found.visible),
             min_agreement * len(found.rows),
         )
         if located.inliers.sum() < enough:
@@ -108,10 +132,9 @@ class LandmarkSearch(NamedTuple):
         return VerifiedPose(located.T_world_camera, found.rows[located.inliers])
 
 
-def search_radius_px(lost_s: float, camera: PinholeCamera, parameters: RecoveryParameters) -> float:
+def search_radius_px(lost_s: float, camera: PinholeCamera) -> float:
     """Search radius around a prediction, px, this long after the last pose."""
-    grown = parameters.radius_share + parameters.growth_share_per_s * lost_s
-    return camera.width * min(grown, parameters.max_radius_share)
+    return camera.width * min(_RADIUS_SHARE + _GROWTH_SHARE_PER_S * lost_s, MAX_RADIUS_SHARE)
 
 
 def are_enough(points: int, parameters: MappingParameters) -> bool:

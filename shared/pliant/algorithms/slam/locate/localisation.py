@@ -20,7 +20,18 @@ from pliant.algorithms.slam.parameters import LocalisationParameters
 _COARSE_SIGMAS = 4.0
 """The kernel is first this many times wider, so that a poor prediction still converges."""
 
+KERNEL_SIGMA_PX = 2.0
+"""Scale of the Geman-McClure kernel of a pose."""
+
 _PREDICTION_GATE_PX = 20.0
+
+MIN_PREDICTED_SHARE = 0.5
+"""Inlier share below which the predicted pose is compared with RANSAC."""
+
+RANSAC_GATE_PX = 4.0
+"""Maximum reprojection error of an inlier of RANSAC."""
+
+_RANSAC_SAMPLES = 100
 
 _START_PX = 0.3
 """Standard deviation of the last pose's rotation from which the gyro starts: landmarks in one view
@@ -48,24 +59,25 @@ def locate(
     camera: PinholeCamera,
     parameters: LocalisationParameters,
     generator: np.random.Generator,
+    samples: int = _RANSAC_SAMPLES,
 ) -> Localisation:
     """Return the pose on which most points agree, from the best prediction or by P3P and RANSAC.
 
     predictions: poses (4, 4) to start from, at least one.   The caller decides whether the inliers
-    suffice.
+    suffice.   samples: of RANSAC.
     """
     points_world, points_n = seen.points_world, camera.normalise(seen.points_px.astype(np.float64))
     gate = _PREDICTION_GATE_PX / camera.fx
     costs = [_cost(T_world_camera, points_world, points_n, gate) for T_world_camera in predictions]
     start = predictions[int(np.argmin(costs))]
     best = refine(start, seen, camera, parameters)
-    if best.inliers.sum() < parameters.min_predicted_share * len(points_n):
+    if best.inliers.sum() < MIN_PREDICTED_SHARE * len(points_n):
         found = pose_by_ransac(
             points_world,
             points_n,
             generator,
-            gate=parameters.ransac_gate_px / camera.fx,
-            samples=parameters.ransac_samples,
+            gate=RANSAC_GATE_PX / camera.fx,
+            samples=samples,
         )
         if found is not None:
             other = refine(found[0], seen, camera, parameters)
@@ -104,7 +116,7 @@ def _refine(
     is_pure_rotation, limit_px = False, parameters.inlier_px
     inliers = np.zeros(len(seen.points_px), np.bool_)
     for widening in (1.0,) if near else (_COARSE_SIGMAS, 1.0):
-        bundle = BundleParameters(kernel_sigma_px=widening * parameters.kernel_sigma_px)
+        bundle = BundleParameters(kernel_sigma_px=widening * KERNEL_SIGMA_PX)
         if seen.spread is None:
             found = refine_pose(T_world_camera, seen, camera, bundle, inlier_px=limit_px)
         else:

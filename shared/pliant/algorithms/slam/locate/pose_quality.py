@@ -12,7 +12,6 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.slam.parameters import SupportParameters
 from pliant.compiler.kernel import kernel
 
 _COLUMNS, _LINES = 8, 6
@@ -23,6 +22,19 @@ _LEAST_SEEN = 5
 
 _AGAINST = 0.2
 """A cell contradicts a pose with a smaller share of inliers among its tracks."""
+
+SETTLED_S = 0.5
+"""Age at which a track in enough keyframes should have a landmark."""
+
+_MAX_CONTRARY_SHARE = 0.12
+"""Share of the image whose motion contradicts the pose: with more it is doubtful."""
+
+_MIN_SHARE = 0.4
+"""Share of the visible landmarks that fit the pose: with less it is doubtful."""
+
+MIN_SPREAD = 0.06
+"""Standard deviation of the fitting landmarks, share of the image width or height: with less the
+pose is doubtful."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,13 +75,13 @@ def support_of(
     )
 
 
-def why_doubtful(support: Support, parameters: SupportParameters) -> str:
+def why_doubtful(support: Support) -> str:
     """Why the pose may be wrong; "" if it is well supported."""
-    if support.contrary > parameters.max_contrary_share:
+    if support.contrary > _MAX_CONTRARY_SHARE:
         return f"doubtful: {support.contrary:.0%} of the image disagrees with the camera motion"
-    if support.share < parameters.min_share:
+    if support.share < _MIN_SHARE:
         return f"doubtful: only {support.share:.0%} of the visible map points agree with the pose"
-    if support.spread < parameters.min_spread:
+    if support.spread < MIN_SPREAD:
         return "doubtful: all visible map points lie in one place of the image"
     return ""
 

@@ -168,7 +168,7 @@ class Landmarks:
         rows, ids = zip(*removed)
         return np.concatenate(rows), np.concatenate(ids)
 
-    def go_on_after(self, last_id: int) -> None:
+    def continue_after(self, last_id: int) -> None:
         """Reserve the ids up to this one for another map."""
         self._next_id = max(self._next_id, last_id + 1)
 

@@ -8,12 +8,13 @@ curvature extrema of a frame, the 600 strongest, one in each part of the image, 
 from another view, while corners are a third and more.
 
 Index.  It does not compare each descriptor of each place.  The first bytes of a binary descriptor
-are hashes of it: its bits are comparisons chosen to be as independent as possible, so descriptors
-of one corner often share 16 consecutive bits, and others hardly ever (multi-index hashing, Norouzi
-et al., CVPR 2012).  Each such chunk is a word.  Places are scored by the words that they share with
-the image, weighted by how rare those are (Sivic and Zisserman, "Video Google", ICCV 2003).  Words
-of many places carry little information and are skipped, so a query takes time with the square root
-of the number of places.  There is no vocabulary to train or to load; the index grows with the map.
+are hashes of it: its bits are comparisons chosen to be as independent as possible.  So descriptors
+of one corner often share 16 consecutive bits, and others hardly ever do (multi-index hashing,
+Norouzi et al., CVPR 2012).  Each such chunk is a word.  Places are scored by the words that they
+share with the image, weighted by how rare those are (Sivic and Zisserman, "Video Google", ICCV
+2003).  Words of many places carry little information and are skipped, so a query takes time with
+the square root of the number of places.  There is no vocabulary to train or to load; the index
+grows with the map.
 
 Repetition.  An image may repeat itself a step aside: tiles, chequers, windows, bars.  If the
 content at X is repeated at X + d, a camera that is a step d aside sees the same image.  Then it
@@ -63,7 +64,7 @@ _COMMON, _COMMON_GROWTH = 8.0, 2.0
 """A word of this many places, or of this times the root of their number, is skipped."""
 
 _LEAST_DEAD = 64
-"""Forgotten places before the index is made anew."""
+"""Forgotten places before the index is rebuilt."""
 
 _APART_SHARE = 0.025
 """Of the image's width: what looks alike within is one corner, found at two scales."""
@@ -246,10 +247,10 @@ class PlaceIndex:
         ]
         dead = len(self.ids) - len(self.features)
         if dead > max(_LEAST_DEAD, len(self.features)):
-            anew = PlaceIndex()
+            rebuilt = PlaceIndex()
             for place, features in self.features.items():
-                anew.add(place, features)
-            vars(self).update(vars(anew))
+                rebuilt.add(place, features)
+            vars(self).update(vars(rebuilt))
 
     def query(self, features: Features) -> list[int]:
         """Ids of the places that share words with an image, the most alike first."""

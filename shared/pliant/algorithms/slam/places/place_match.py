@@ -11,7 +11,10 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
+from pliant.algorithms.slam.locate.landmark_search import MIN_AGREEING, RANSAC_SAMPLES
+from pliant.algorithms.slam.locate.localisation import RANSAC_GATE_PX
 from pliant.algorithms.slam.locate.point_patches import look_alike
+from pliant.algorithms.slam.locate.pose_quality import MIN_SPREAD
 from pliant.algorithms.slam.locate.reacquisition import MaximaGrid
 from pliant.algorithms.slam.map.landmarks import MAPPED, Landmarks
 from pliant.algorithms.slam.parameters import MappingParameters
@@ -65,18 +68,18 @@ def match_places(
         corners.append((here, seen))
         known &= deep[alike[:, column]]
     (xyz_a, seen_a), (xyz_b, seen_b) = corners
-    if np.count_nonzero(known) < parameters.recovery.min_agreeing:
+    if np.count_nonzero(known) < MIN_AGREEING:
         return "few_corners"
     pairs = Pairs(xyz_a=xyz_a, xyz_b=xyz_b, seen_a=seen_a, seen_b=seen_b).of(known)
     found = similarity_by_ransac(
-        pairs, generator, gate=limits.ransac_gate_px / camera.fx,
-        samples=parameters.recovery.ransac_samples,
+        pairs, generator, gate=RANSAC_GATE_PX / camera.fx,
+        samples=RANSAC_SAMPLES,
     )  # fmt: skip
-    if found is None or found[1].sum() < parameters.recovery.min_agreeing:
+    if found is None or found[1].sum() < MIN_AGREEING:
         return "few_corners"
     S_a_b, agreeing = found
     rows, points_px = np.zeros((0, 2), np.int32), np.zeros((0, 2), np.float32)
-    for gate_px in (limits.ransac_gate_px, limits.inlier_px):
+    for gate_px in (RANSAC_GATE_PX, limits.inlier_px):
         rows, guided, points_px = _guided(
             S_a_b, old, new, points, camera, gate_px, parameters.reacquisition.min_zncc
         )
@@ -84,10 +87,10 @@ def match_places(
             return "few_points"
         S_a_b = refine_similarity(S_a_b, guided, scale=gate_px / camera.fx)
     spread = (points_px.std(axis=0) / np.array([camera.width, camera.height])).min()
-    if spread < parameters.support.min_spread:
+    if spread < MIN_SPREAD:
         return "one_spot"
     agreeing_corners = alike[known][agreeing, 1]
-    if repeats(new.features, agreeing_corners, pairs.xyz_b[agreeing], camera, parameters):
+    if repeats(new.features, agreeing_corners, pairs.xyz_b[agreeing], camera):
         return "repeated"
     return PlaceMatch(S_old_new=_between_worlds(S_a_b, old, new), rows=rows)
 

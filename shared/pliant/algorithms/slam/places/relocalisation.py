@@ -19,8 +19,17 @@ from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.slam.calibration.corrected_view import CorrectedView
 from pliant.algorithms.slam.estimate.absolute_pose import pose_by_ransac
 from pliant.algorithms.slam.estimate.pose import Correspondences
-from pliant.algorithms.slam.locate.landmark_search import NEAR, LandmarkSearch, are_enough
-from pliant.algorithms.slam.locate.localisation import refine
+from pliant.algorithms.slam.locate.landmark_search import (
+    MAX_RADIUS_SHARE,
+    MIN_AGREEING,
+    MIN_AGREEMENT,
+    NEAR,
+    RANSAC_SAMPLES,
+    LandmarkSearch,
+    are_enough,
+)
+from pliant.algorithms.slam.locate.localisation import RANSAC_GATE_PX, refine
+from pliant.algorithms.slam.locate.pose_quality import MIN_SPREAD
 from pliant.algorithms.slam.locate.reacquisition import MaximaGrid
 from pliant.algorithms.slam.map.covisibility import most_shared, rows_of
 from pliant.algorithms.slam.map.keyframe import Keyframe
@@ -104,7 +113,6 @@ def relocalise(
     search: in the frame's image.
     """
     points, parameters, camera = search.points, search.parameters, search.camera
-    own = parameters.recovery
     best: Recognised | None = None
     rivals: list[Recognised] = []
     proof: _Proposed | None = None
@@ -114,7 +122,7 @@ def relocalise(
         rows = _rows_near(place.keyframe, place.segment, points)
         for proposed in _propose(seen, place, points, camera, parameters, search.generator):
             alone = _speaks_for_itself(proposed, camera, parameters)
-            least = 0.0 if alone else own.min_agreement
+            least = 0.0 if alone else MIN_AGREEMENT
             proved = search.verify(proposed.T_world_camera, rows, least)
             if proved is None:
                 continue
@@ -139,7 +147,7 @@ def relocalise(
     if any(_is_as_good(rival, best, points, parameters) for rival in rivals):
         return None
     here = transform(inverse(proof.T_world_camera), proof.xyz)
-    if repeats(seen, proof.corners, here, camera, parameters):
+    if repeats(seen, proof.corners, here, camera):
         return None
     place = proof.place
     best = _looked_about(best, place, search)
@@ -159,7 +167,7 @@ def _looked_about(
     landmarks on the wall are within their radius then, too.
     """
     rows = _rows_near(place.keyframe, place.segment, search.points)
-    radius_px = NEAR * search.parameters.recovery.max_radius_share * search.camera.width
+    radius_px = NEAR * MAX_RADIUS_SHARE * search.camera.width
     proved = search.near(found.T_world_camera, rows, radius_px)
     if proved is None or len(proved.rows) <= found.inliers:
         return found
@@ -190,7 +198,7 @@ def rest_is_elsewhere(
     seen = search.verify(T_world_camera, rows, 0.0)
     if seen is None:
         return False
-    radius_px = search.camera.width * search.parameters.recovery.max_radius_share
+    radius_px = search.camera.width * MAX_RADIUS_SHARE
     rest = np.setdiff1d(rows, seen.rows)
     other = search.near(seen.T_world_camera, rest, radius_px)
     return (
@@ -200,16 +208,14 @@ def rest_is_elsewhere(
     )
 
 
-def repeats(
-    seen: Features, corners: I64, xyz: F64, camera: PinholeCamera, parameters: MappingParameters
-) -> bool:
+def repeats(seen: Features, corners: I64, xyz: F64, camera: PinholeCamera) -> bool:
     """Whether the evidence is as good for a pose a step aside, because the image repeats itself
     there.
 
     corners, xyz: the evidence for a pose, as of ``repeated_share``.
     """
     share = repeated_share(
-        seen, corners, xyz, camera, gate_px=parameters.localisation.ransac_gate_px,
+        seen, corners, xyz, camera, gate_px=RANSAC_GATE_PX,
         least_step=_SAME_SHIFT * float(np.median(xyz[:, 2])),
     )  # fmt: skip
     return share > _AS_GOOD
@@ -250,18 +256,18 @@ def _propose(
 
     Moved objects take their corners along, which may be the majority.
     """
-    limits, own = parameters.localisation, parameters.recovery
+    limits = parameters.localisation
     pairs = match(seen, place.features)
     world, known = corners_in_map(place.keyframe, place.features, points, camera)
     pairs = pairs[known[pairs[:, 1]]]
     alike = len(pairs)
-    while len(pairs) >= own.min_agreeing:
+    while len(pairs) >= MIN_AGREEING:
         xyz, points_px = world[pairs[:, 1]], seen.points_px[pairs[:, 0]]
         found = pose_by_ransac(
             xyz, camera.normalise(points_px.astype(np.float64)), generator,
-            gate=limits.ransac_gate_px / camera.fx, samples=own.ransac_samples,
+            gate=RANSAC_GATE_PX / camera.fx, samples=RANSAC_SAMPLES,
         )  # fmt: skip
-        if found is None or found[1].sum() < own.min_agreeing:
+        if found is None or found[1].sum() < MIN_AGREEING:
             return
         agree = found[1]
         located = refine(found[0], Correspondences(xyz, points_px), camera, limits)
@@ -284,7 +290,7 @@ def _speaks_for_itself(
     return (
         len(proposed.corners_px) >= parameters.localisation.min_inliers
         and proposed.share >= _MOST
-        and spread >= parameters.support.min_spread
+        and spread >= MIN_SPREAD
     )
 
 

@@ -1,10 +1,10 @@
 """The similarity between two cameras' coordinates of paired points, most of which may be wrong.
 
 Three pairs give one in closed form (Umeyama, PAMI 1991).  RANSAC (Fischler and Bolles 1981) selects
-the one under which most points project to their observations in both cameras, as ORB-SLAM does for
-loops (Mur-Artal et al., T-RO 2015, section VII.B).  Depths of a map are far less certain than
-directions, so errors are counted, and then minimised, in the images and not in space.  Two cameras
-at the same position do not determine the scale by their images, so the depths of both maps
+the one under which most points project to their observations in both cameras.  ORB-SLAM does the
+same for loops (Mur-Artal et al., T-RO 2015, section VII.B).  Depths of a map are far less certain
+than directions, so errors are counted, and then minimised, in the images and not in space.  Two
+cameras at the same position do not determine the scale by their images, so the depths of both maps
 contribute with a small weight.
 """
 

@@ -17,6 +17,9 @@ _MIN_DEPTH = 1e-6
 _ADJUSTMENTS = 3
 """Rounds of adjustment and removal of outliers."""
 
+_MAX_MEDIAN_ERROR_PX = 1.0
+"""Maximum median reprojection error of a start."""
+
 _LEAST_WAITING = 12
 """Minimum waiting frames, however old: a time lapse has no more."""
 
@@ -141,8 +144,8 @@ def adjusted_start(
         point_index = renumber[point_index[keep]].astype(np.int32)
         if len(ids) < start.min_points:
             return f"too few points: {len(ids)} of {start.min_points}"
-    if median > start.max_median_error_px:
-        return f"no consistent start: error {median:.1f} of {start.max_median_error_px:.1f} px"
+    if median > _MAX_MEDIAN_ERROR_PX:
+        return f"no consistent start: error {median:.1f} of {_MAX_MEDIAN_ERROR_PX:.1f} px"
     return Start(
         frames=np.array([frame.frame for frame in chosen]),
         T_world_camera=T_world_camera,

@@ -17,7 +17,7 @@ from pliant.algorithms.slam.calibration.corrected_view import CorrectedView, mov
 from pliant.algorithms.slam.estimate.epipolar import rotation_between
 from pliant.algorithms.slam.estimate.pose import Correspondences
 from pliant.algorithms.slam.frame import Frame, IdealFrame
-from pliant.algorithms.slam.locate.localisation import refine
+from pliant.algorithms.slam.locate.localisation import Motion, refine
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.algorithms.slam.parameters import LocalisationParameters, MappingParameters
 from pliant.algorithms.slam.start.first_map import BufferedFrame, Start, keep_newest
@@ -125,6 +125,19 @@ def earlier_poses(
         yield EarlierPose(
             frame=frame, keyframe=reference, T_world_camera=T_world_camera, inliers=inliers
         )
+
+
+def motion_of_start(placed: list[EarlierPose], waiting: InitialisationBuffer) -> Motion:
+    """Return the motion at the newest frame of a start.   placed: its poses, the newest first."""
+    stamps_ns = {each.frame: each.stamp_ns for each in waiting.frames}
+    newest, before = placed[0], placed[min(1, len(placed) - 1)]
+    return Motion(
+        frames=(before.frame, newest.frame),
+        stamps_ns=(stamps_ns[before.frame], stamps_ns[newest.frame]),
+        poses=(before.T_world_camera, newest.T_world_camera),
+        tracked=newest.inliers,
+        to_points=newest.inliers,
+    )
 
 
 def returned_poses(

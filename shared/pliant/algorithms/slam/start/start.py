@@ -49,6 +49,12 @@ _DECIDING = 500
 _NOISE_PX = 1.0
 """Error of a track without parallax."""
 
+_EPIPOLAR_GATE_PX = 1.0
+"""Maximum epipolar error of an inlier."""
+
+_MIN_INLIER_SHARE = 0.5
+"""Of the tracks that two frames share."""
+
 _MIN_FRAMES = 3
 """Minimum frames of a start: a point of two frames always agrees with some depth."""
 
@@ -214,10 +220,10 @@ def _start_from(
     start = parameters.start
     a = _normalise(camera, waiting[pair.reference].points_px[pair.indices_reference])
     b = _normalise(camera, waiting[-1].points_px[pair.indices_newest])
-    gate = start.epipolar_gate_px / camera.fx
+    gate = _EPIPOLAR_GATE_PX / camera.fx
     every = max(1, len(a) // _GLANCE)
     glance = likely_pose(a[::every], b[::every], gate=gate)
-    if glance is not None and glance.inliers.mean() >= start.min_inlier_share:
+    if glance is not None and glance.inliers.mean() >= _MIN_INLIER_SHARE:
         parallax = _parallax_deg(glance, wanted.percentile)
         if parallax < _CLEARLY_LESS * wanted.least_deg:
             return _too_little(parallax, wanted.least_deg, "deg")
@@ -279,8 +285,8 @@ def _waited_s(waiting: list[BufferedFrame]) -> float:
 
 def _why_not_with(two_views: RelativePose, start: StartParameters, wanted: _Parallax) -> str:
     share = float(two_views.inliers.mean())
-    if share < start.min_inlier_share:
-        return f"too few tracks agree with one motion: {share:.0%} of {start.min_inlier_share:.0%}"
+    if share < _MIN_INLIER_SHARE:
+        return f"too few tracks agree with one motion: {share:.0%} of {_MIN_INLIER_SHARE:.0%}"
     parallax = _parallax_deg(two_views, wanted.percentile)
     if parallax < wanted.least_deg:
         return _too_little(parallax, wanted.least_deg, "deg")

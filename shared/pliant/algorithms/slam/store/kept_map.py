@@ -145,7 +145,7 @@ def take_in(
     ids, rows = points.ids[rows][order], rows[order]
     if (np.diff(ids) == 0).any():
         raise ValueError("a repeated point")
-    points.go_on_after(int(ids[-1]) if len(ids) else -1)
+    points.continue_after(int(ids[-1]) if len(ids) else -1)
     segments: list[Segment] = []
     for number in sorted({each.segment for each in kept}):
         mine = [each for each in kept if each.segment == number]
