@@ -62,6 +62,18 @@ def test_alone_a_depth_is_contradicted_by_those_who_see_through_it() -> None:
     assert np.mean(near[interior()]) < 0.02
 
 
+def test_there_is_no_depth_without_texture() -> None:
+    """A bare sky over a roof, up to three pixels from it, where windows see the roof."""
+    depths = {step: exact(step) for step in AROUND}
+    bare = replace(view(3), grey=view(3).grey.copy())
+    bare.grey[:20] = 225 + np.arange(CAMERA.width) % 2
+    found = consensus(bare, exact(3), [view(step) for step in depths], list(depths.values()))
+    assert not found.confidences[:17].any()
+    assert not found.inverse_depths[:17].any()
+    whole = agreed(depths)
+    np.testing.assert_array_equal(found.inverse_depths[23:], whole.inverse_depths[23:])
+
+
 def test_depth_is_unknown_without_confident_views() -> None:
     found = agreed({step: exact(step, 0.0) for step in AROUND}, exact(3, 0.0))
     assert not found.inverse_depths.any()

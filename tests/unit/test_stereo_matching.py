@@ -6,7 +6,13 @@ from stereo_scene import CAMERA, pose, true_inverse, view
 
 from pliant.algorithms.arrays import F32, F64, U8, U16
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.stereo.matching import WORST, inverse_depths_between, matching_costs
+from pliant.algorithms.stereo.matching import (
+    NOISE_VARIANCE,
+    WORST,
+    inverse_depths_between,
+    matching_costs,
+    textured,
+)
 from pliant.algorithms.stereo.semi_global import Penalties, best_steps, path_sums
 from pliant.algorithms.stereo.views import (
     NOT_SHOWN,
@@ -205,3 +211,15 @@ def test_half_a_view_sees_the_same_points() -> None:
     small = view(0).halved()
     point = np.array([[0.3, -0.2, 2.0]])
     np.testing.assert_allclose(small.camera.project(point), (CAMERA.project(point) + 0.5) / 2 - 0.5)
+
+
+def test_texture_is_more_variance_than_noise_has() -> None:
+    """Against plain numpy, at steps of grey about the limit."""
+    generator = np.random.default_rng(0)
+    grey = (128 + generator.integers(-1, 2, (30, 40)) * np.arange(40) // 8).astype(np.uint8)
+    padded = np.pad(grey.astype(np.int64), 3, mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (7, 7)).reshape(30, 40, 49)
+    spread = 49 * (windows**2).sum(axis=2) - windows.sum(axis=2) ** 2
+    expected = spread > NOISE_VARIANCE * 49**2
+    assert 0.2 < expected.mean() < 0.8
+    np.testing.assert_array_equal(textured(grey, 3), expected)

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32
-from pliant.algorithms.stereo.sweep import poses_of
+from pliant.algorithms.stereo.matching import textured
+from pliant.algorithms.stereo.sweep import FINE_RADIUS, poses_of
 from pliant.algorithms.stereo.views import DenseDepth, StereoView, motion
 from pliant.compiler.kernel import kernel
 
@@ -31,7 +32,7 @@ def consensus(
 ) -> DenseDepth:
     """The inverse depth with the largest sum at each pixel, and its support, which may exceed 1.
 
-    others, depths: (N) neighbours of the same camera.
+    Without texture there is none.   others, depths: (N) neighbours of the same camera.
     """
     shape = view.grey.shape
     w, c = (np.zeros((len(others) + 1, *shape), np.float32) for _ in range(2))
@@ -52,7 +53,8 @@ def consensus(
     )  # fmt: skip
     smooth = np.asarray(cv2.medianBlur(found, 3), np.float32)
     found = np.where((found > 0.0) & (smooth > 0.0), smooth, found)
-    return DenseDepth(found, support)
+    known = textured(view.grey, FINE_RADIUS)
+    return DenseDepth(*(np.where(known, each, np.float32(0.0)) for each in (found, support)))
 
 
 @kernel

@@ -14,9 +14,10 @@ with v the variance of noise, so that windows without texture match neither well
 
 from typing import TypeAlias
 
+import cv2
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, U8, U32
+from pliant.algorithms.arrays import F32, F64, I32, U8, U32, BoolArray
 from pliant.algorithms.stereo.views import NOT_SHOWN, Motion
 from pliant.compiler.kernel import kernel
 
@@ -31,6 +32,20 @@ _OUTSIDE = 3.0
 
 Places: TypeAlias = tuple[I32, F32, F32]
 """Of a row: the quad at each pixel, and the shares of its right and lower pixels."""
+
+
+def textured(grey: U8, radius: int) -> BoolArray:
+    """(H, W): where the grey of the window (2 radius + 1)^2 varies by more than its noise.
+
+    Elsewhere a match is that of other pixels: a surface seems to continue into a bare sky.
+    """
+    side = 2 * radius + 1
+    values, n = grey.astype(np.float64), side * side
+    sums, squares = (  # whole numbers, hence exact
+        cv2.boxFilter(each, cv2.CV_64F, (side, side), normalize=False)
+        for each in (values, values * values)
+    )
+    return np.asarray(n * squares - sums * sums > NOISE_VARIANCE * n * n, np.bool_)
 
 
 def matching_costs(

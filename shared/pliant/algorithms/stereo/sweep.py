@@ -28,7 +28,7 @@ from pliant.compiler.kernel import kernel
 _MOST_DEPTHS = 64
 _COARSE_STEP_PX = 0.6
 """Between two inverse depths, in the median source."""
-_COARSE_RADIUS, _FINE_RADIUS = 2, 3
+_COARSE_RADIUS, FINE_RADIUS = 2, 3
 """Of windows, pixels."""
 _FINE_STEP_PX = 0.4
 _FINE_STEPS = 4
@@ -88,7 +88,7 @@ def swept_depth(view: StereoView, sources: Sequence[StereoView], anchors: Anchor
     # The fine sweep: along that surface, windows of 7 x 7 pixels, SGM.
     surface = upsampled(surface, view.grey.shape, _JUMP_STEPS * step)
     offsets = np.linspace(-_FINE_STEPS, _FINE_STEPS, 2 * _FINE_STEPS + 1) * _FINE_STEP_PX / slope
-    costs = _costs(view, sources, surface, offsets, _FINE_RADIUS)
+    costs = _costs(view, sources, surface, offsets, FINE_RADIUS)
     fine = best_steps(costs, view.grey, Penalties().halved())
     moved = (offsets[0] + (_FINE_STEP_PX / slope) * fine.steps).astype(np.float32)
     inverse_depths = _median(np.maximum(surface + moved, np.float32(0.0)), 3)
