@@ -24,6 +24,7 @@ from pliant.errors import ResultError
 from pliant.export.export import export_result
 from pliant.export.on_earth import write_geo_registration
 from pliant.export.posed_images import PosedImage
+from pliant.formats.las import write_las
 from pliant.formats.tum import read_tum
 from pliant.messages import topics
 from pliant.messages.types import CameraStream, Extrema, Header, MapUpdate
@@ -219,6 +220,20 @@ def test_las_has_the_points_in_their_utm_zone(tmp_path: Path) -> None:
     assert str(found.header.creation_date) == "2023-11-14"
     written = file.read_bytes()
     assert export_result(tmp_path, "las", None, force=True).read_bytes() == written
+
+
+def test_las_beside_the_antimeridian(tmp_path: Path) -> None:
+    """Longitudes of both signs are one place, whose mean is not in Africa; 2000 km are too far."""
+    positions = {
+        "latitude_deg": np.array([-17.0, -17.0]), "altitude_m": np.zeros(2),
+        "colours": np.zeros((2, 3), np.uint8), "stamp_ns": 0,
+    }  # fmt: skip
+    write_las(tmp_path / "a.las", longitude_deg=np.array([179.9999, -179.9998]), **positions)
+    system = laspy.read(tmp_path / "a.las").header.parse_crs()
+    assert system is not None
+    assert system.to_epsg() == 32701
+    with pytest.raises(ResultError, match="too far apart"):
+        write_las(tmp_path / "b.las", longitude_deg=np.array([150.0, 175.0]), **positions)
 
 
 def test_las_without_a_map(placed: Path) -> None:

@@ -114,6 +114,25 @@ def test_samples_remove_drift(sensor: Sensor) -> None:
     assert np.mean(after) < 0.5 * np.mean(before)
 
 
+def test_gaps_count_neither_for_nor_against_the_samples() -> None:
+    """Samples that end early, and six gaps of half a second."""
+    motion = hand_held(30.0, seed=3)
+    true = keyframes_of(motion)
+    T, V = drifted(true, 3e-4, 6e-3, np.random.default_rng(0))
+    before = error(T[:, :3, 3], true[:, :3, 3])
+    samples = measured(motion, 0, ADIS16448)
+    seconds = 1e-9 * (samples.stamps_ns - samples.stamps_ns[0])
+    for kept in (seconds < 20.0, (seconds + 2.0) % 5.0 > 0.5):
+        some = ImuSamples(
+            stamps_ns=samples.stamps_ns[kept], gyro_rad_s=samples.gyro_rad_s[kept],
+            accel_m_s2=samples.accel_m_s2[kept],
+        )  # fmt: skip
+        found = coupled(motion, T, V, some)
+        assert found is not None
+        assert found.inertial_sigma < 1.3
+        assert error(found.state.p, true[:, :3, 3]) < 0.75 * before
+
+
 def test_a_good_map_stays_and_a_bad_sensor_weighs_little() -> None:
     motion = hand_held(30.0, seed=4)
     true = keyframes_of(motion)

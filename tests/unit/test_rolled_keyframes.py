@@ -67,6 +67,19 @@ def test_there_is_no_motion_without_supported_frames_beside() -> None:
     assert motion(told((9, 11), inliers=5)) is None
 
 
+def test_frames_of_another_segment_do_not_count() -> None:
+    """Each segment is a world of its own: a cut after frame 9, of keyframe 2."""
+    earlier = replace(
+        told((8, 9)), pose_keyframes=np.full(2, 2), keyframe_ids=np.array([2]),
+        keyframe_frames=np.array([5]), pose_segments=np.ones(2, np.int32),
+        keyframe_segments=np.ones(1, np.int32),
+    )  # fmt: skip
+    assert motion(earlier, told((10,))) is None
+    found = motion(earlier, told((10, 11)))
+    assert found is not None
+    np.testing.assert_allclose(found, [*OMEGA, *NU], rtol=0.05, atol=1e-3)
+
+
 def test_the_motion_grows_with_the_map_and_follows_corrected_poses() -> None:
     grown = replace(
         nothing(TRACKING),

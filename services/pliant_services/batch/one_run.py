@@ -45,7 +45,7 @@ class Errand:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """The outcome.  exit_code: None if it was interrupted.  told: its entry in the table."""
+    """The outcome.  exit_code: None if it was interrupted.  entry: of it in the table."""
 
     exit_code: int | None
     seconds: float = 0.0

@@ -49,8 +49,8 @@ def export(
         str | None,
         typer.Option(
             metavar="X,Y,Z,X,Y,Z",
-            help="glb, obj, watertight, ply, splat: keep only the surface or the points in the "
-            "box between two corners, in the frame and unit of mesh.ply.",
+            help="glb, obj, watertight, ply, splat, las: keep only the surface or the points in "
+            "the box between two corners, in the frame and unit of mesh.ply.",
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing output.")] = False,

@@ -30,8 +30,8 @@ def write_animated_glb(path: Path, mesh: AnimatedMesh, extras: dict[str, Any]) -
 
     At key frame k its own target has the weight 1 and all others 0, with linear interpolation
     between.  So vertices move on straight lines from key frame to key frame.  Positions are exact
-    there but for the rounding of float32. said: what readers show of the object.  Raises
-    ResultError.
+    there but for the rounding of float32.  extras: what readers show of the object.
+    Raises ResultError.
     """
     glb = Glb()
     rest, *moved = mesh.positions

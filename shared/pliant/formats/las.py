@@ -39,9 +39,8 @@ def write_las(
     laspy or pyproj is missing.
     """
     laspy, pyproj = load_las()
-    system = pyproj.CRS.from_epsg(
-        utm_epsg(float(np.mean(latitude_deg)), float(np.mean(longitude_deg)))
-    )
+    middle = np.angle(np.mean(np.exp(1j * np.radians(longitude_deg))), deg=True)
+    system = pyproj.CRS.from_epsg(utm_epsg(float(np.mean(latitude_deg)), float(middle)))
     to_utm = pyproj.Transformer.from_crs(4326, system, always_xy=True)
     east, north = to_utm.transform(longitude_deg, latitude_deg)
     header = laspy.LasHeader(version="1.4", point_format=_POINT_FORMAT)
@@ -51,7 +50,12 @@ def write_las(
     header.scales = np.full(3, _UNIT_M)
     header.offsets = np.floor([np.min(east), np.min(north), np.min(altitude_m)])
     points = laspy.LasData(header)
-    points.x, points.y, points.z = east, north, altitude_m
+    try:
+        points.x, points.y, points.z = east, north, altitude_m
+    except OverflowError:
+        raise ResultError(
+            f"{path}: points are too far apart for LAS: crop them with --crop"
+        ) from None
     wide = colours.astype(np.uint16) * np.uint16(257)  # 0 to 65535, as the format has them
     points.red, points.green, points.blue = wide.T
     try:

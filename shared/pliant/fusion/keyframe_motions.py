@@ -26,20 +26,22 @@ class KeyframeMotions:
     def take(self, update: MapDelta) -> None:
         """Take the poses of an update."""
         if len(update.moved_keyframes):
-            for keyframe, pose in (*self._poses.values(), *self._last.values()):
-                matrix = update.map_moves().matrices(np.array([keyframe]))[0]
-                pose[:3] *= np.cbrt(np.linalg.det(matrix[:3, :3]))
+            held = [*self._poses.values(), *self._last.values()]
+            keyframes = np.array([keyframe for keyframe, _ in held], np.int64)
+            matrices = update.map_moves().matrices(keyframes)
+            for (_, pose), scale in zip(held, _scales(matrices), strict=True):
+                pose[:3] *= scale
         self._keyframes.update(update.keyframe_frames.tolist())
         others = self._last
         for row in np.flatnonzero(update.pose_inliers >= MIN_INLIERS).tolist():
-            told = int(update.pose_keyframes[row]), update.poses_keyframe_camera[row].copy()
-            others[int(update.pose_frames[row])] = told
+            relative = update.poses_keyframe_camera[row].copy()
+            others[int(update.pose_frames[row])] = int(update.pose_keyframes[row]), relative
         newest, self._last = max(others, default=0), {}
-        for frame, told in others.items():
+        for frame, pose in others.items():
             if not self._keyframes.isdisjoint((frame - 1, frame + 1)):
-                self._poses[frame] = told
+                self._poses[frame] = pose
             elif frame >= newest - 1:
-                self._last[frame] = told
+                self._last[frame] = pose
 
     def motion(self, keyframe: int, keyframes: Mapping[int, Keyframe]) -> F64 | None:
         """(6,) of a keyframe per frame interval, as of ``FramePoses.motions``; None: unknown.
@@ -52,11 +54,16 @@ class KeyframeMotions:
         T = pose_to_matrix(own.pose_world_camera)
         known = {own.frame: T}
         for frame in (own.frame - 1, own.frame + 1):
-            beside, pose = self._poses.get(frame, (-1, None))
-            if pose is not None and beside in keyframes:
-                T_world_beside = pose_to_matrix(keyframes[beside].pose_world_camera)
-                known[frame] = T_world_beside @ pose_to_matrix(pose)
+            number, pose = self._poses.get(frame, (-1, None))
+            beside = keyframes.get(number)
+            if pose is not None and beside is not None and beside.segment == own.segment:
+                known[frame] = pose_to_matrix(beside.pose_world_camera) @ pose_to_matrix(pose)
         if len(known) < 2:
             return None
         first, last = min(known), max(known)
         return motion_between(known[first], known[last], T) / (last - first)
+
+
+def _scales(matrices: F64) -> F64:
+    """(N,) scales of (N, 4, 4) similarities."""
+    return np.asarray(np.cbrt(np.linalg.det(matrices[:, :3, :3])), np.float64)

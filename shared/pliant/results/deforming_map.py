@@ -27,6 +27,7 @@ _INTERVAL_NS = 190_000_000
 _MOST = 150
 """Keyframes; a longer run has them farther apart."""
 _TOO_FEW = "too few tracks through several keyframes determine it"
+_NO_JUDGES = "too few other tracks judge it"
 _FEWEST = 30
 """Tracks that judge it."""
 _CERTAIN, _PREDICTED, _GAIN, _STIFF = 0.65, 0.95, 0.6, 0.5
@@ -79,7 +80,7 @@ def adjust_and_write(
         camera.height,
     )
     if len(judges) < _FEWEST:
-        return _TOO_FEW
+        return _NO_JUDGES if len(landmarks) >= _FEWEST else _TOO_FEW
     T = pose_to_matrix(np.array([poses[frame] for frame in frames.tolist()]))
     try:
         found = adjust_deforming(chosen, T, camera)

@@ -48,15 +48,13 @@ from pliant.algorithms.inertial.residuals import (
 
 _ITERATIONS = 20
 _CONVERGED = 0.02
-"""Change of a variance, as a share."""
+"""Change of a variance, as a share; and of a pose, in its standard deviations by the images."""
 _HUBER = 4.7
 """Of the length of a residual of 9 numbers: 1 of 100 is longer (chi-square)."""
 _FIXED = 1e9
 """Information of what is held, relative to the mean of the poses' own."""
 _COLUMNS = 1024
 """Eliminated at a time: bounds memory."""
-_PRIORS = 10
-"""Of numbers: of the first biases, the lever arm and the offset."""
 _POSE = np.arange(6)
 
 
@@ -91,9 +89,11 @@ def couple(
         if not np.isfinite(step.own).all():
             return None
         state = state.moved(step.common, step.own)
-        before = s2, g2
+        before, poses = (s2, g2), step.own[:, :6].ravel()
+        change = np.sqrt(float(poses @ information @ poses) / (s2 * len(poses)))
         s2, g2 = max(s2 * s_factor, least_px**2), max(g2 * g_factor, 1.0)
-        if max(abs(np.log(s2 / before[0])), abs(np.log(g2 / before[1]))) < _CONVERGED:
+        changes = abs(np.log(s2 / before[0])), abs(np.log(g2 / before[1])), change
+        if max(changes) < _CONVERGED:
             turned = so3_log(nodes.R.swapaxes(1, 2) @ state.R)
             moved = np.concatenate([turned, state.p - nodes.p], axis=1).ravel()
             return Coupled(
@@ -243,7 +243,10 @@ class System:
         after += of_each(self._second, step.own[rows + 1]) + self._common @ step.common
         explained = float((covariance[: 6 * count, : 6 * count] * self._visual).sum()) / self._s2
         of_images = 6 * count - explained
-        residuals = after.size + 6 * count + _PRIORS
+        # Of lever arm and offset, the biases of each stretch, and velocities that nothing ties.
+        untied = count - len(np.union1d(rows, rows + 1))
+        priors = 4 + 6 * (count - len(rows)) + 3 * untied
+        residuals = after.size + 6 * count + priors
         of_samples = residuals - (OWN * count + COMMON) - of_images
         squares = float(moved @ self._visual @ moved) / self._s2, float((after**2).sum()) / self._g2
         return squares[0] / max(of_images, 1.0), squares[1] / max(of_samples, 1.0)

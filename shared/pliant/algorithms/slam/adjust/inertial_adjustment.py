@@ -62,7 +62,7 @@ def with_samples(
 ) -> BundleResult:  # fmt: skip
     """Return the adjustment after the samples, or as it was where they do not improve it."""
     times_ns, T = timed.keyframes_ns, found.T_world_camera
-    if len(T) > _MOST_KEYFRAMES or times_ns.min() < 0 or (np.diff(times_ns) <= 0).any():
+    if not 2 <= len(T) <= _MOST_KEYFRAMES or times_ns.min() < 0 or (np.diff(times_ns) <= 0).any():
         return found
     frames = T[timed.hosts] @ timed.T_host_frame
     aligned = align_inertial(timed.frames_ns, frames, timed.samples)
