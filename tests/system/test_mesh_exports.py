@@ -49,10 +49,9 @@ def test_a_textured_mesh_has_the_colours_that_its_keyframes_show(
     run = read_run(recording.path)
     assert run.stream is not None
     images = list(keyframe_images(recording, run, run.history.longest_segment()))
-    poses = run.history.keyframe_poses()
     assert len(images) > 4
-    for frame, image, _ in images[:: len(images) // 3]:
-        T_world_camera = pose_to_matrix(poses[frame][1])
+    for number, image, _ in images[:: len(images) // 3]:
+        T_world_camera = pose_to_matrix(run.history.keyframes[number].pose_world_camera)
         seen = view_mesh(mesh.positions, mesh.triangles, run.stream.camera, T_world_camera)
         at = seen.interpolate(mesh.triangles, mesh.uvs) * np.float32(len(mesh.texture)) - 0.5
         drawn = cv2.remap(mesh.texture, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
@@ -145,7 +144,7 @@ def test_an_empty_box_is_one_line_with_the_place_of_the_mesh(result: Path, tmp_p
         with pytest.raises(ResultError, match=rf"--crop 1000,.*: no {what} is inside; the extent"):
             export_result(result, kind, path, crop=box)
         assert not path.exists()
-    with pytest.raises(ResultError, match="only for glb, obj, watertight, ply and splat"):
+    with pytest.raises(ResultError, match="only for glb, obj, watertight, ply, splat and las"):
         export_result(result, "tum", tmp_path / "poses.txt", crop=box)
 
 

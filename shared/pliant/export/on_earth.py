@@ -15,6 +15,7 @@ from pliant.export.posed_images import PosedImage
 from pliant.formats.earth_track import EarthTrack, write_geojson, write_gpx
 from pliant.formats.las import load_las, write_las
 from pliant.formats.text import write_lines
+from pliant.recording.measured import fixes_of
 from pliant.recording.reader import Recording
 from pliant.results.earth import place_on_earth, summary_of
 from pliant.results.mesh_files import mesh_of
@@ -65,8 +66,10 @@ def write_geo_registration(
     recording: Recording, run: Run, path: Path, images: Sequence[PosedImage]
 ) -> None:
     """A line "NAME LATITUDE LONGITUDE ALTITUDE" for each image, as COLMAP's ``model_aligner`` reads
-    them.  No file where no fixes place the map.
+    them.  No file if no fixes place the map.
     """
+    if not len(fixes_of(recording).stamps_ns):
+        return
     try:
         _, fit = _placed(recording, run)
     except ResultError:

@@ -25,12 +25,12 @@ class StillFrames:
         self.rolled = lru_cache(maxsize=1)(self._rolled)
 
     def _rolled(self, frame: int) -> RolledFrame | None:
-        """The effect of a rolling shutter on a frame that has a pose; None without any.
+        """The effect of a rolling shutter on a frame; None without any, or without a pose.
 
         By the motion between the frames around it, at the median depth of what it sees.
         """
         near = [f for f in (frame - 1, frame, frame + 1) if f in self.poses]
-        if not self._readout or len(near) < 2:
+        if not self._readout or frame not in self.poses or len(near) < 2:
             return None
         T, camera = self.poses[frame], self.view.camera
         first, last = self.poses[near[0]], self.poses[near[-1]]

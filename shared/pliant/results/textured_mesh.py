@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, U8, BoolArray
+from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.image.masks import mask_image, unpacked
 from pliant.algorithms.image.sharpness import sharpness
 from pliant.algorithms.meshing.decimation import decimated
@@ -51,8 +52,10 @@ def textured(
     exposures = ExposureSamples(shown.positions[at], shown.normals[at])
 
     def seen() -> Iterator[tuple[F64, U8, F32]]:
-        for frame, image, used in keyframe_images(recording, run, segment, views):
-            T_world_camera, view = still.poses[frame], still.rolled(frame) or still.view
+        for number, image, used in keyframe_images(recording, run, segment, views):
+            keyframe = run.history.keyframes[number]
+            T_world_camera = pose_to_matrix(keyframe.pose_world_camera)
+            view = still.rolled(keyframe.frame) or still.view
             mask = None if used is None else mask_image(used, view.image) > 0
             yield T_world_camera, view.image(image), shown.depths(camera, T_world_camera, mask)
 
@@ -70,12 +73,11 @@ def textured(
 def keyframe_images(
     recording: Recording, run: Run, segment: int, most: int | None = None
 ) -> Iterator[tuple[int, U8, BoolArray | None]]:
-    """Frame, (H, W, 3) image and mask (H, W) of each keyframe of a segment that has an image.
+    """Id, (H, W, 3) image and mask (H, W) of each keyframe of a segment that has an image.
 
     most: of at most this many of its keyframes, spread over all; None: of all.
     """
-    frames = {n: k.frame for n, k in run.history.keyframes.items() if k.segment == segment}
-    here = sorted(frames)
+    here = sorted(n for n, known in run.history.keyframes.items() if known.segment == segment)
     wanted = set(here[:: max(1, -(-len(here) // most))] if most else here)
     for topic in (topics.KEYFRAME, topics.KEYFRAME_FINAL):
         for message in recording.decoded(topic):
@@ -87,7 +89,7 @@ def keyframe_images(
                 image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
                 if image is not None:
                     used = unpacked(masks[number]) if number in masks else None
-                    yield frames[number], np.asarray(image, np.uint8), used
+                    yield number, np.asarray(image, np.uint8), used
 
 
 def _with_texture(points: F32, faces: I32, uvs: F32, texture: U8) -> TexturedMesh:
