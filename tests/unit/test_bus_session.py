@@ -106,16 +106,24 @@ def test_a_port_in_use_is_one_line(endpoint: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_no_session_sends_messages_through_shared_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    open_it, shared = zenoh.open, list[str]()
+def test_without_room_for_shared_memory_a_session_does_without(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    open_it, tried = zenoh.open, list[str]()
 
-    def opened(config: zenoh.Config) -> zenoh.Session:
-        shared.append(config.get_json("transport/shared_memory/enabled"))
+    def refuse_it(config: zenoh.Config) -> zenoh.Session:
+        tried.append(config.get_json("transport/shared_memory/enabled"))
+        if tried[-1] == "true":
+            raise zenoh.ZError("Unable to create POSIX shm segment: OS error 12 at segment.rs:85.")
         return open_it(config)
 
-    monkeypatch.setattr(zenoh, "open", opened)
+    monkeypatch.setattr(zenoh, "open", refuse_it)
+    monkeypatch.setattr(session, "_LEAST_SHARED_BYTES", 0)
     endpoint = free_endpoint()
     router = open_router(endpoint)
     open_session([endpoint]).close()  # type: ignore[no-untyped-call]
     router.close()  # type: ignore[no-untyped-call]
-    assert shared == ["false"] * 2
+    assert tried == ["true", "false"] * 2
+    monkeypatch.setattr(session, "_LEAST_SHARED_BYTES", 1 << 62)  # as in a container
+    open_router(free_endpoint()).close()  # type: ignore[no-untyped-call]
+    assert tried == ["true", "false"] * 2 + ["false"]

@@ -26,8 +26,17 @@ _PATIENCE_MS = 60_000  # Zenoh's defaults lose messages after a stall of 5 to 10
 TOKEN_LEASE_S = 5.0 + 1e-3 * _PATIENCE_MS
 """Seconds after which the router drops a service whose machine has vanished."""
 _LONGEST_SOCKET = 100  # bytes; Linux takes 107 and macOS 103
+_SHARED_BYTES = 4 << 20
+"""Without images; each process has that of all that it reads.  Zenoh's default has room for some
+images."""
+_LEAST_SHARED_BYTES = 1 << 30
+"""Of /dev/shm.  Docker's has 64 MiB: there a run stood still, as one reader mapped a segment of
+Zenoh 1.10.2 anew for each image, and got none.
+"""
 _SOCKET = "unixsock-stream"
 _FOLDER, _BUS = "pliant-", "bus"
+_NO_SHARED_MEMORY = "shm segment"
+"""Zenoh's message for a full or missing /dev/shm."""
 _NO_SOCKET = "no Unix socket available: every user of this machine can reach the services"
 _MAX_BYTES = max(topic.max_bytes for topic in TOPICS) + (1 << 20)
 """A peer that announces more than our largest topic is cut off, before memory is allocated."""
@@ -74,10 +83,14 @@ class Identity:
         return own
 
 
-def _config(mode: str, identity: Identity | None) -> zenoh.Config:
+def _config(mode: str, identity: Identity | None, *, pixels: bool = False) -> zenoh.Config:
     config = zenoh.Config()
-    # Zenoh 1.10 lost every message of a sender to one reader, which mapped a segment anew for each.
-    config.insert_json5("transport/shared_memory/enabled", "false")
+    if not _has_shared_memory():
+        config.insert_json5("transport/shared_memory/enabled", "false")
+    elif not pixels:
+        config.insert_json5(
+            "transport/shared_memory/transport_optimization/pool_size", str(_SHARED_BYTES)
+        )
     config.insert_json5("mode", json.dumps(mode))
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("scouting/gossip/enabled", "false")
@@ -103,17 +116,20 @@ def _config(mode: str, identity: Identity | None) -> zenoh.Config:
     return config
 
 
-def open_session(endpoints: Sequence[str], identity: Identity | None = None) -> zenoh.Session:
+def open_session(
+    endpoints: Sequence[str], identity: Identity | None = None, *, pixels: bool = False
+) -> zenoh.Session:
     """Connect as a client.  ``identity``: for endpoints such as tls/host:7447.
 
+    pixels: images are sent, so that more memory is shared with readers on this machine.
     Raises BusError when no endpoint answers in time.
     """
-    config = _config("client", identity)
+    config = _config("client", identity, pixels=pixels)
     _set_endpoints(config, "connect", endpoints)
     config.insert_json5("connect/timeout_ms", str(int(CONNECT_TIMEOUT_S * 1000)))
     config.insert_json5("connect/exit_on_failure", "true")
     try:
-        return zenoh.open(config)
+        return _opened(config)
     except zenoh.ZError as error:
         raise BusError(
             f"cannot reach {', '.join(endpoints)} within {CONNECT_TIMEOUT_S:.0f} s: is the router "
@@ -137,12 +153,31 @@ def open_router(
     config.insert_json5("listen/exit_on_failure", "true")
     config.insert_json5("listen/timeout_ms", "0")
     try:
-        return zenoh.open(config)
+        return _opened(config)
     except zenoh.ZError as error:
         raise BusError(
             f"cannot listen on {', '.join(endpoints)}: is the port in use? Choose another with "
             f"--port ({_first_line(error)})"
         ) from None
+
+
+def _has_shared_memory() -> bool:
+    try:
+        found = os.statvfs("/dev/shm")
+    except OSError:
+        return False
+    return found.f_frsize * found.f_blocks >= _LEAST_SHARED_BYTES
+
+
+def _opened(config: zenoh.Config) -> zenoh.Session:
+    """A session; without shared memory where there is no room for any.  Raises ZError."""
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        if _NO_SHARED_MEMORY not in str(error):
+            raise
+    config.insert_json5("transport/shared_memory/enabled", "false")
+    return zenoh.open(config)
 
 
 def _set_endpoints(config: zenoh.Config, what: str, endpoints: Sequence[str]) -> None:
