@@ -118,12 +118,13 @@ def test_without_room_for_shared_memory_a_session_does_without(
         return open_it(config)
 
     monkeypatch.setattr(zenoh, "open", refuse_it)
-    monkeypatch.setattr(session, "_LEAST_SHARED_BYTES", 0)
+    monkeypatch.setattr(session, "_LOCKED_BYTES", 0)
     endpoint = free_endpoint()
     router = open_router(endpoint)
     open_session([endpoint]).close()  # type: ignore[no-untyped-call]
     router.close()  # type: ignore[no-untyped-call]
     assert tried == ["true", "false"] * 2
-    monkeypatch.setattr(session, "_LEAST_SHARED_BYTES", 1 << 62)  # as in a container
+    monkeypatch.setattr(session, "_LOCKED_BYTES", 1 << 62)
+    monkeypatch.setattr(session, "_CAP_IPC_LOCK", 0)  # an ordinary user, or a container
     open_router(free_endpoint()).close()  # type: ignore[no-untyped-call]
     assert tried == ["true", "false"] * 2 + ["false"]

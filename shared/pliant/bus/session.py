@@ -5,6 +5,7 @@ import json
 import os
 import re
 import reprlib
+import resource
 import shutil
 import socket
 import stat
@@ -29,10 +30,12 @@ _LONGEST_SOCKET = 100  # bytes; Linux takes 107 and macOS 103
 _SHARED_BYTES = 4 << 20
 """Without images; each process has that of all that it reads.  Zenoh's default has room for some
 images."""
-_LEAST_SHARED_BYTES = 1 << 30
-"""Of /dev/shm.  Docker's has 64 MiB: there a run stood still, as one reader mapped a segment of
-Zenoh 1.10.2 anew for each image, and got none.
+_LOCKED_BYTES = 1 << 30
+"""Zenoh locks in memory what senders share, and keeps it when they restart.  Beyond the limit of
+the process it drops their messages without a word (zenoh, issues 2787 and 2788).
 """
+_CAP_IPC_LOCK = 1 << 14
+"""Capability (7) to lock any amount; not that of root in a container."""
 _SOCKET = "unixsock-stream"
 _FOLDER, _BUS = "pliant-", "bus"
 _NO_SHARED_MEMORY = "shm segment"
@@ -85,7 +88,7 @@ class Identity:
 
 def _config(mode: str, identity: Identity | None, *, pixels: bool = False) -> zenoh.Config:
     config = zenoh.Config()
-    if not _has_shared_memory():
+    if not may_lock_memory():
         config.insert_json5("transport/shared_memory/enabled", "false")
     elif not pixels:
         config.insert_json5(
@@ -161,12 +164,17 @@ def open_router(
         ) from None
 
 
-def _has_shared_memory() -> bool:
+def may_lock_memory() -> bool:
+    """Whether this process may lock all the shared memory of a session: mostly root alone."""
+    limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if limit == resource.RLIM_INFINITY or limit >= _LOCKED_BYTES:
+        return True
     try:
-        found = os.statvfs("/dev/shm")
-    except OSError:
+        status = Path("/proc/self/status").read_text(encoding="utf-8")
+    except OSError:  # not Linux
         return False
-    return found.f_frsize * found.f_blocks >= _LEAST_SHARED_BYTES
+    found = re.search(r"^CapEff:\s*([0-9a-f]+)$", status, re.MULTILINE)
+    return found is not None and bool(int(found[1], 16) & _CAP_IPC_LOCK)
 
 
 def _opened(config: zenoh.Config) -> zenoh.Session:
