@@ -49,6 +49,18 @@ def test_two_sheets_are_not_joined() -> None:
     assert (sides.all(axis=1) | ~sides.any(axis=1)).all()
 
 
+def test_a_gap_is_closed_only_where_both_ends_lie_in_one_plane() -> None:
+    """Two pieces of 11 x 11 surfels, 0.1 apart, with a gap of 0.4 between them."""
+    left, right = grid(2.0, left=-1.2), grid(2.0, left=0.2)
+    surfels = surfels_at(np.concatenate([left, right]))
+    _, _, triangles = surface_of(surfels)
+    assert len(triangles) == 2 * 21 * 10
+    turned = surfels.tangents.copy()
+    turned[121:, :, 0] = (0.8, 0.0, 0.6)
+    _, _, triangles = surface_of(replace(surfels, tangents=turned))
+    assert len(triangles) == 2 * 2 * 10 * 10
+
+
 def test_only_what_is_tracked_is_surface() -> None:
     surfels = surfels_at(grid(2.0))
     surfels.state[:5] = SurfelState.OUTLIER

@@ -7,10 +7,14 @@ from pliant.algorithms.meshing.delaunay import triangulate
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 
 _MAX_LENGTHS = 3.0
-"""A longer edge, in medians of all edges, spans a hole."""
+"""A longer edge, in medians of all edges, may span a hole."""
 _MAX_STEEPNESS = 2.0
 """An edge whose ends differ more in depth than this times their lateral distance joins two
 surfaces, or a surface in profile.
+"""
+_MAX_SLOPE = 0.25
+"""An edge of any length lies on one surface if it leaves the planes of both ends by at most this
+share of its length.
 """
 
 
@@ -36,4 +40,8 @@ def surface_of(surfels: SurfelFrame) -> tuple[I64, F32, I32]:
     across = np.linalg.norm(edges[..., :2], axis=2)
     joined = lengths <= _MAX_LENGTHS * np.median(lengths)
     joined &= np.abs(edges[..., 2]) <= _MAX_STEEPNESS * across
+    here = (normals @ T[:3, :3])[triangles]
+    there = np.roll(here, 1, axis=1)
+    off_plane = np.maximum(np.abs((edges * here).sum(axis=2)), np.abs((edges * there).sum(axis=2)))
+    joined |= off_plane <= _MAX_SLOPE * lengths
     return rows, normals.astype(np.float32), triangles[joined.all(axis=1)]
