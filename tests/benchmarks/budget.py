@@ -36,6 +36,8 @@ from pliant.results.folder import RECORDING_NAME
 from pliant_services.processes import BY_NAME, readers_of
 
 _LOOK_S = 0.05
+_MEMORY_LOOKS = 20
+"""Every so many looks memory is measured: the system adds up all pages for it."""
 _TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 _ROOT = Path(pliant.__file__).parents[2]
 _LAUNCHER = "launcher"
@@ -114,7 +116,10 @@ class Budget:
 
 @dataclass(frozen=True)
 class _Look:
-    """All processes at a moment: CPU seconds, peak and present memory (MiB)."""
+    """All processes at a moment: CPU seconds, peak and present memory (MiB).
+
+    now_mib: pages of several processes in equal parts; empty where it was not measured.
+    """
 
     at_ns: int
     cpu_s: Mapping[str, float]
@@ -181,7 +186,7 @@ def _run(root: Path, source: str, options: Sequence[str]) -> Budget:
         reader.start()
         looks: list[_Look] = []
         while process.poll() is None:
-            looks.append(_look(process.pid))
+            looks.append(_look(process.pid, memory=len(looks) % _MEMORY_LOOKS == 0))
             time.sleep(_LOOK_S)
         reader.join()
         process.stderr.close()
@@ -190,7 +195,7 @@ def _run(root: Path, source: str, options: Sequence[str]) -> Budget:
         return _budget(output, looks, began_ns)
 
 
-def _look(launcher: int) -> _Look:
+def _look(launcher: int, *, memory: bool) -> _Look:
     cpu: dict[str, float] = {}
     peak: dict[str, float] = {}
     now: dict[str, float] = {}
@@ -202,9 +207,12 @@ def _look(launcher: int) -> _Look:
             if pid != launcher:
                 name = words[words.index(b"service") + 1].decode()
             fields = (place / "stat").read_text().rpartition(")")[2].split()
-            sizes = dict(re.findall(r"(VmHWM|VmRSS):\s+(\d+) kB", (place / "status").read_text()))
+            peak_kb = re.findall(r"VmHWM:\s+(\d+) kB", (place / "status").read_text())[0]
             cpu[name] = (int(fields[11]) + int(fields[12])) * _TICK_S
-            peak[name], now[name] = int(sizes["VmHWM"]) / 1024, int(sizes["VmRSS"]) / 1024
+            peak[name] = int(peak_kb) / 1024
+            if memory:
+                rollup = (place / "smaps_rollup").read_text()
+                now[name] = int(re.findall(r"^Pss:\s+(\d+) kB", rollup, re.MULTILINE)[0]) / 1024
     return _Look(time.time_ns(), cpu, peak, now)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from zenoh_buses import PATIENCE_S, WINDOW, die, image, in_thread, reader, writer
+from zenoh_buses import PATIENCE_S, WINDOW, camera_stream, die, image, in_thread, reader, writer
 
 from pliant.algorithms.inertial.preintegration import GyroSignal
 from pliant.bus import health
@@ -59,7 +59,7 @@ def test_a_sender_is_never_more_than_a_window_ahead_of_its_slowest_reader(endpoi
 
 
 def test_a_reader_of_images_reports_at_once_when_it_has_taken_all(endpoint: str) -> None:
-    """Long before a quarter of the window: in live mode its sender waits for that."""
+    """Long before half of the window: in live mode its sender waits for that."""
     with writer(endpoint) as sender, reader(endpoint) as bus:
         bus._report_every = 100
         taken = bus.receive(topics.IMAGE)
@@ -69,6 +69,31 @@ def test_a_reader_of_images_reports_at_once_when_it_has_taken_all(endpoint: str)
             assert bus._inputs[topics.IMAGE.key].reported == frame + 1
             sender.wait_until_taken(topics.IMAGE)
             assert sender.untaken(topics.IMAGE, "tracking") == 0
+        sender.end_all()
+        assert list(taken) == []
+
+
+@pytest.mark.parametrize(("mode", "reports"), [("live", [1, 2, 3, 4]), ("lossless", [0, 2, 2, 4])])
+def test_who_may_lag_reports_each_message_live_and_half_a_window_else(
+    endpoint: str, mode: str, reports: list[int]
+) -> None:
+    common = {"endpoints": [endpoint], "session": "test", "window": WINDOW}
+    lags = {"tracking": Window(8, 1 << 20)}
+    stream, images = topics.STREAM, topics.IMAGE
+    sends = {stream: ("tracking",), images: ("tracking",)}
+    reads = {stream: "ingest", images: "ingest"}
+    with (
+        ZenohBus(service="ingest", inputs={}, outputs=sends, **common) as sender,
+        ZenohBus(service="tracking", inputs=reads, outputs={}, lags=lags, **common) as bus,
+    ):
+        sender.publish(stream, camera_stream(mode))
+        sender.end(stream)
+        for frame in range(WINDOW):
+            sender.publish(images, image(frame))
+        assert [message.mode for message in bus.receive(stream)] == [mode]
+        taken = bus.receive(images)
+        found = [(next(taken).frame, bus._inputs[images.key].reported) for _ in range(WINDOW)]
+        assert found == list(enumerate(reports))
         sender.end_all()
         assert list(taken) == []
 

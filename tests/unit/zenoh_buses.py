@@ -6,7 +6,7 @@ import numpy as np
 
 from pliant.bus.zenoh_bus import ZenohBus
 from pliant.messages import topics
-from pliant.messages.types import Image
+from pliant.messages.types import CameraStream, Image
 
 WINDOW = 4
 
@@ -22,6 +22,13 @@ def image(frame: int) -> Image:
         grey=np.full((48, 64), frame % 256, np.uint8),
         colour=np.zeros((0, 0, 3), np.uint8),
     )
+
+
+def camera_stream(mode: str) -> CameraStream:
+    return CameraStream(
+        frame=0, stamp_ns=0, frame_id="camera", source="test", mode=mode, frames=-1,
+        calibration="", width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5,
+    )  # fmt: skip
 
 
 def reader(endpoint: str, name: str = "tracking") -> ZenohBus:

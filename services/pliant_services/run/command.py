@@ -197,7 +197,7 @@ class _Followed:
 
     def on_status(self, status: Status) -> None:
         """Take in a status; called from the bus' thread."""
-        if earlier.is_aside(self._output):
+        if status.service == "ingest" and earlier.is_aside(self._output):  # once a frame
             with suppress(OSError, PliantError):  # looked at again when the folder is left
                 self._look()
         self._progress.on_status(status)

@@ -13,6 +13,9 @@ from pliant.datasets.static_mask import static_line
 from pliant.messages.types import Status
 from pliant_services.processes import BY_NAME
 
+_SHOWN_A_SECOND = 4
+"""Drawing the bar takes more than reading the reports of a frame."""
+
 _STATES = {WAITING: "starting", TRACKING: "tracking", LOST: "lost"}
 
 
@@ -30,7 +33,6 @@ class Progress:
         self._console = _Console(stderr=True)
         self._lock = threading.Lock()
         self._counters: dict[str, float] = {}
-        self._note = ""
         self._static = ""
         self._bar = RichProgress(
             TextColumn("{task.fields[state]:>9}"),
@@ -38,6 +40,7 @@ class Progress:
             MofNCompleteColumn(),
             TextColumn("{task.fields[rate]} {task.fields[detail]}"),
             console=self._console,
+            refresh_per_second=_SHOWN_A_SECOND,
             disable=not sys.stderr.isatty(),
             transient=True,
         )
@@ -58,40 +61,38 @@ class Progress:
             if static != self._static:
                 self._static = static
                 self.say(static or "the static area has changed: nothing is masked any more")
-            if status.service == "surfels":
-                self._show_surfels(status)
-            if status.service != "bundle_adjustment":
+            if self._bar.disable:
                 return
-            self._note = status.note
-            counters = self._counters
-            task = self._bar.tasks[0]
-            detail = (
-                f"{counters.get('tracks', 0):.0f} tracks, {counters.get('inliers', 0):.0f} mapped, "
-                f"{counters.get('points', 0):.0f} points"
-            )
-            unmapped = counters.get("unmapped", 0)
-            dropped = counters.get("dropped", 0) + counters.get("broken", 0)
-            self._bar.update(
-                self._task,
-                completed=status.frame + 1,
-                state=_STATES.get(int(counters.get("state", WAITING)), ""),
-                rate=f"{task.speed:.1f} fps" if task.speed else "",
-                detail=detail
-                + (f", {dropped:.0f} dropped" if dropped else "")
-                + (f", {unmapped:.0f} not mapped" if unmapped else "")
-                + (f" ({self._note})" if self._note else ""),
-            )
+            if status.service == "surfels":
+                self._show(status, "following", self._surfels())
+            elif status.service == "bundle_adjustment":
+                state = _STATES.get(int(self._counters.get("state", WAITING)), "")
+                self._show(status, state, self._mapped())
 
-    def _show_surfels(self, status: Status) -> None:
-        counters, task = self._counters, self._bar.tasks[0]
-        detail = f"{counters['alive']:.0f} of {counters['surfels']:.0f} surfels alive"
+    def _show(self, status: Status, state: str, detail: str) -> None:
+        speed = self._bar.tasks[0].speed  # rich sums over a thousand updates
         self._bar.update(
             self._task,
             completed=status.frame + 1,
-            state="following",
-            rate=f"{task.speed:.1f} fps" if task.speed else "",
+            state=state,
+            rate=f"{speed:.1f} fps" if speed else "",
             detail=detail + (f" ({status.note})" if status.note else ""),
         )
+
+    def _mapped(self) -> str:
+        counters = self._counters
+        unmapped = counters.get("unmapped", 0)
+        dropped = counters.get("dropped", 0) + counters.get("broken", 0)
+        return (
+            f"{counters.get('tracks', 0):.0f} tracks, {counters.get('inliers', 0):.0f} mapped, "
+            f"{counters.get('points', 0):.0f} points"
+            + (f", {dropped:.0f} dropped" if dropped else "")
+            + (f", {unmapped:.0f} not mapped" if unmapped else "")
+        )
+
+    def _surfels(self) -> str:
+        alive, every = self._counters["alive"], self._counters["surfels"]
+        return f"{alive:.0f} of {every:.0f} surfels alive"
 
     def on_rest(self, names: Sequence[str]) -> None:
         """Report the services that still work after the last frame."""

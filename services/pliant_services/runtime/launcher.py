@@ -87,7 +87,7 @@ class Fleet:
             if heard is None or heard.is_end:
                 return
             with suppress(MessageError):  # not from a service of ours
-                message = codec.decode(Status, heard.data)
+                message = codec.decode(Status, heard.data, views=True)
                 if message.service in self._services:
                     self._frames[message.service] = message.frame
                     on_status(message)

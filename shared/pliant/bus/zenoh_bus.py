@@ -37,7 +37,7 @@ from pliant.bus.waits import Waits
 from pliant.errors import BusError, MessageError
 from pliant.messages import codec
 from pliant.messages.topics import WITH_PIXELS, Topic
-from pliant.messages.types import Header, StreamEnd
+from pliant.messages.types import CameraStream, Header, StreamEnd
 from pliant.state import load_state, save_state
 
 _LOOK_S = 0.5
@@ -93,8 +93,9 @@ class ZenohBus:
         self._prefix = f"pliant/{session_name(session)}"
         lags = lags or {}
         own_lag = lags.get(service, Window(0, 0))
-        # A lagging reader is waited for by its reports, which cover all messages.
-        self._report_every = 1 if service in lags else max(1, window // 4)
+        self._report_every = max(1, window // 2)
+        self._may_lag = service in lags
+        self._live = True  # until the stream says otherwise
         self._checkpoints = checkpoints
         self._packed = frozenset(packed)
         self._disturb = disturb or (lambda: None)
@@ -275,6 +276,8 @@ class ZenohBus:
             if received.is_end:
                 return
             assert received.message is not None
+            if isinstance(received.message, CameraStream):
+                self._live = received.message.mode == "live"
             yield received.message
 
     def reads(self, topic: Topic) -> bool:
@@ -389,11 +392,12 @@ class ZenohBus:
     # -- what comes in -------------------------------------------------------------------------
 
     def _report_taken(self, entry: InLink, received: Received) -> None:
-        # Each credit wakes the router and the sender, while the service waits: for most, a
-        # quarter of the window at a time is enough.
-        box, newest_wins = entry.box, entry.topic.newest_wins
-        all_taken = newest_wins and not box.waiting
-        if received.is_end or all_taken or box.taken - entry.reported >= self._report_every:
+        # Each credit wakes the router and the sender: half a window at a time is enough.  Live, the
+        # choice of images depends on what has been taken.
+        box = entry.box
+        all_taken = entry.topic.newest_wins and not box.waiting
+        at_once = received.is_end or (self._live and (self._may_lag or all_taken))
+        if at_once or box.taken - entry.reported >= self._report_every:
             self._keeper.report(entry)
 
     def _on_stop(self, _: zenoh.Sample) -> None:
