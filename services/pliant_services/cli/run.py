@@ -81,7 +81,7 @@ def run(
         bool,
         _everyday(
             "--light",
-            help="Use a third of the tracks: less CPU, larger errors. For slow computers.",
+            help="Use a fifth of the tracks: less CPU, larger errors. For slow computers.",
         ),
     ] = False,
     quality: Annotated[

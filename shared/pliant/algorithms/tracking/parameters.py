@@ -15,7 +15,7 @@ class TrackingParameters(Parameters):
         default=0.5, ge=0.0, description="Minimum |kappa| of an extremum, DN^3."
     )
     max_tracks: int = Field(
-        default=6_000, ge=100, le=100_000, description="Maximum tracks in a frame."
+        default=10_000, ge=100, le=100_000, description="Maximum tracks in a frame."
     )
     min_zncc: float = Field(
         default=0.88,
