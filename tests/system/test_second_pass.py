@@ -97,7 +97,7 @@ def test_the_first_result_stays_if_the_second_pass_fails(
         raise error
 
     if place != "reach_back":
-        monkeypatch.setattr(module, "_messages", lambda *_: {})
+        monkeypatch.setattr(module, "_messages", lambda *_: ({}, {}))
         monkeypatch.setattr(module, "_record", lambda *_: None)
     monkeypatch.setattr(module, place, ends)
     assert second_pass(output, request, 0) == (130 if isinstance(error, KeyboardInterrupt) else 0)
