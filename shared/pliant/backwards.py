@@ -12,8 +12,11 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32, I64
+from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.image.masks import clearance_in, filled
+from pliant.algorithms.inertial.samples import ImuSamples
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
+from pliant.algorithms.slam.adjust.segment import PlacedFrames
 from pliant.algorithms.slam.calibration.self_calibration import widened
 from pliant.algorithms.slam.frame import Frame
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
@@ -23,7 +26,7 @@ from pliant.config import Config
 from pliant.datasets.base import Dataset, SourceFrame
 from pliant.datasets.rectifier import Rectifier, rectified
 from pliant.errors import DatasetError
-from pliant.map_history import MapHistory
+from pliant.map_history import MIN_INLIERS, MapHistory
 from pliant.messages.types import Image
 
 _LEAD_S, _LEAD_FRAMES = 1.0, 5
@@ -98,13 +101,14 @@ class Reached:
     """The result of reading backwards, besides the history.
 
     kept: the whole map.   keyframes: new ones, by id.   joined: merged segments.
-    last: the last update, with the calibration.
+    last: the last update, with the calibration.   counters: of the mapper.
     """
 
     kept: list[KeptKeyframe] = field(default_factory=list[KeptKeyframe])
     keyframes: dict[int, MadeKeyframe] = field(default_factory=dict[int, MadeKeyframe])
     joined: list[tuple[int, int]] = field(default_factory=list[tuple[int, int]])
     last: MapDelta | None = None
+    counters: dict[str, float] = field(default_factory=dict[str, float])
 
 
 def reach_back(
@@ -113,11 +117,13 @@ def reach_back(
     known: Sequence[KeptKeyframe],
     stretches: Sequence[Stretch],
     history: MapHistory,
+    samples: ImuSamples | None = None,
 ) -> Reached:
     """Read stretches of a source backwards, from which a map was made.
 
     known: that map.   history: of it, which becomes that of both: frames that have a pose keep it
-    but for what moves the map.   Raises DatasetError if the source has changed.
+    but for what moves the map.   samples: inertial, with which keyframes of both passes shall
+    agree.   Raises DatasetError if the source has changed.
     """
     rectifier = Rectifier(dataset.calibration)
     camera = rectifier.camera
@@ -143,6 +149,11 @@ def reach_back(
         collected.take_keyframes(mapper.publish_keyframes(), number, image, mapper.waiting_frames)
     collected.take(mapper.finish())
     collected.take_keyframes(mapper.publish_keyframes())
+    if samples is not None and len(samples.stamps_ns):
+        # Samples need the frames of both passes, relative to keyframes that are nearly final.
+        collected.take(mapper.finish(samples=samples, placed=collected.placed()))
+        collected.take_keyframes(mapper.publish_keyframes())
+    found.counters = mapper.counters
     session = max(each.session for each in known)
     for each in map(_reversed, mapper.kept()):
         if each.session > session:  # it is of the same session as the first pass
@@ -185,6 +196,24 @@ class _Collected:
         history.apply(delta, frame=int(self._numbers[0]), stamp_ns=0, final=True)
         self._found.joined += [(gone, to) for gone, to in delta.joined.tolist()]
         self._found.last = delta
+
+    def placed(self) -> PlacedFrames:
+        """Frames with a pose, and the capture times of keyframes, of both passes."""
+        history = self._history
+        stamps_ns, keyframes = history.stamps_ns, history.keyframes
+        own = {n: keyframe.frame for n, keyframe in keyframes.items() if keyframe.frame >= 0}
+        own |= {n: int(self._numbers[read]) for n, read in self._made.items()}
+        frames = sorted(
+            (stamps_ns[frame], pose.keyframe, pose.pose_keyframe_camera)
+            for frame, pose in history.frames.items()
+            if pose.inliers >= MIN_INLIERS and pose.keyframe in keyframes
+        )
+        return PlacedFrames(
+            keyframes_ns={n: stamps_ns[frame] for n, frame in own.items()},
+            stamps_ns=np.array([stamp_ns for stamp_ns, _, _ in frames], np.int64),
+            hosts=np.array([host for _, host, _ in frames], np.int64),
+            T_host_frame=pose_to_matrix(np.array([pose for *_, pose in frames]).reshape(-1, 7)),
+        )
 
     def take_keyframes(
         self,

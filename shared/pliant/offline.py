@@ -78,11 +78,16 @@ class Pipeline:
         self._last = image.frame
         return MappedFrame(image, tracks, delta)
 
-    def finish(self, timer: StageTimer = no_stages) -> MapDelta:
-        """The corrections at the end of the stream."""
-        delta = self._mapper.finish(timer)
+    def finish(self, timer: StageTimer = no_stages, samples: ImuSamples | None = None) -> MapDelta:
+        """The corrections at the end of the stream.   samples: inertial, that came meanwhile."""
+        delta = self._mapper.finish(timer, samples)
         self.history.apply(delta, frame=self._last, stamp_ns=0, final=True)
         return delta
+
+    @property
+    def counters(self) -> dict[str, float]:
+        """As those of a mapper."""
+        return self._mapper.counters
 
     def kept(self) -> list[KeptKeyframe]:
         """The map as it is to be kept, once it is finished."""

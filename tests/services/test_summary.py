@@ -29,6 +29,7 @@ from pliant.messages.types import (
     Status,
     StreamEnd,
 )
+from pliant.recording.summary import SECOND_PASS, Summary
 from pliant.recording.writer import RecordingWriter
 from pliant.results.report import rigid_report
 from pliant.results.run import Run
@@ -139,6 +140,27 @@ def test_values_without_evidence_are_left_out_and_dropped_parts_reported() -> No
     report["counters"] = {"bundle_adjustment": counted}
     told = "kept_observations: 1 keyframe and 5200 points dropped, but kept in the results"
     assert any(line.endswith(told) for line in summary(report))
+
+
+def test_what_samples_did_to_the_keyframes_is_reported() -> None:
+    run = Run(stream=stream(2), recorded=Summary())
+    assert rigid_report(run, {})["coupling"] is None
+    did = {"coupling_outcome": 6.0, "coupling_keyframes": 40.0, "coupling_moved_m": 0.0}
+    run.counters["bundle_adjustment"] = did
+    report = rigid_report(run, {})
+    assert report["coupling"]["refusal"].startswith("the residuals are more than ten times")
+    lines = [line for line in summary(report) if "keyframes:" in line]
+    assert lines == [
+        f"inertial samples did not move the keyframes: {report['coupling']['refusal']}"
+    ]
+    # Those of a second pass replace them.
+    second = {"coupling_outcome": "0.0", "coupling_keyframes": "52.0", "coupling_moved_m": "0.0021"}
+    run.recorded.metadata[SECOND_PASS] = {"topics": "map/final", **second}
+    report = rigid_report(run, {})
+    assert report["coupling"] == {"keyframes": 52, "moved_mm": 2.1, "refusal": ""}
+    assert "inertial samples moved 52 keyframes by 2.1 mm in the median" in summary(report)
+    report["inertial_refusal"] = "the gyro explains 12 %"
+    assert not [line for line in summary(report) if "samples moved" in line]
 
 
 def test_one_is_not_many(tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """A source with inertial samples: its result is in metres and level, or as it was."""
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +13,19 @@ from sample_files import write_imu_csv
 
 from pliant.algorithms.geometry import align_umeyama, so3_exp
 from pliant.algorithms.inertial.samples import ImuSamples
+from pliant.algorithms.slam.adjust.inertial_adjustment import CouplingOutcome
+from pliant.config import load_config
 from pliant.datasets.builtin import builtin_folder
 from pliant.formats.ply import read_ply
 from pliant.formats.tum import read_tum
+from pliant.messages import topics
+from pliant.messages.topics import Topic
+from pliant.messages.types import CameraStream, Header, Status
 from pliant.recording.map_file import MapFile
+from pliant.recording.summary import summarise
+from pliant.results.folder import CONFIG_NAME, RECORDING_NAME
+from pliant_services.processes import BY_NAME
+from pliant_services.replay.services import Replay, run_on
 
 pytestmark = pytest.mark.system
 
@@ -40,6 +51,7 @@ def metric(samples: ImuSamples, tmp_path_factory: pytest.TempPathFactory) -> Pat
     done = pliant("run", *HALF, "--imu", imu, "--output", folder / "result")
     assert done.returncode == 0, done.stderr
     assert "in metres by inertial samples of 8 s" in done.stdout
+    assert re.search(r"inertial samples moved \d+ keyframes by [0-9.e-]+ mm", done.stdout)
     return folder / "result"
 
 
@@ -56,6 +68,7 @@ def refused(samples: ImuSamples, tmp_path_factory: pytest.TempPathFactory) -> Pa
     done = pliant("run", *HALF, "--imu", imu, "--output", folder / "result")
     assert done.returncode == 0, done.stderr
     assert "inertial samples not used: the axes of the gyro are left-handed" in done.stdout
+    assert "the keyframes" not in done.stdout  # one refusal is enough
     return folder / "result"
 
 
@@ -63,6 +76,9 @@ def test_the_result_is_in_metres_and_level(metric: Path) -> None:
     report = json.loads((metric / "report.json").read_text())
     assert report["scale_is_metric"]
     assert report["z_is_up"]
+    assert report["coupling"]["keyframes"] == report["keyframes"]
+    assert 0.0 < report["coupling"]["moved_mm"] < 10.0
+    assert report["coupling"]["refusal"] == ""
     found, truth = (
         read_tum(metric / "trajectory.txt"),
         read_tum(builtin_folder(SOURCE) / "groundtruth.txt"),
@@ -88,10 +104,33 @@ def test_a_refusal_leaves_the_result_as_it_is(refused: Path, tmp_path: Path) -> 
     assert not report["scale_is_metric"]
     assert report["scale"] is None
     assert report["inertial_refusal"].startswith("the axes of the gyro are left-handed")
+    assert report["coupling"]["refusal"] == "they do not fit the keyframes"
+    assert report["coupling"]["moved_mm"] == 0.0
     assert not (refused / "scale.yaml").exists()
     done = pliant("run", *HALF, "--output", tmp_path / "without")
     assert done.returncode == 0, done.stderr
     assert digests(refused) == digests(tmp_path / "without")
+    assert json.loads((tmp_path / "without" / "report.json").read_text())["coupling"] is None
+
+
+def test_samples_that_a_live_source_heard_move_the_keyframes(metric: Path) -> None:
+    """They follow the last frame.  Without a gyro the map differs before it is adjusted."""
+    path, service = metric / RECORDING_NAME, BY_NAME["bundle_adjustment"]
+    recorded = Replay(path, summarise(path), [service], load_config(metric / CONFIG_NAME))
+    inputs = {topic: recorded.messages(topic) for topic in (*service.inputs, topics.IMU)}
+    (stream,) = recorded.messages(topics.STREAM)
+    assert isinstance(stream, CameraStream)
+    inputs[topics.STREAM] = iter([replace(stream, sensors_last=True)])
+    counters = dict[str, float]()
+
+    def take(_: Topic, message: Header) -> None:
+        if isinstance(message, Status):
+            counters.update(zip(message.counters, message.values.tolist(), strict=True))
+
+    run_on(service, inputs, load_config(metric / CONFIG_NAME), take)
+    assert "gyro_frames" not in counters
+    assert counters["coupling_outcome"] == CouplingOutcome.MOVED
+    assert 0.0 < counters["coupling_moved_m"] < 0.01
 
 
 def test_samples_of_a_file_come_later(refused: Path, metric: Path) -> None:

@@ -67,6 +67,7 @@ def test_what_was_lost_at_the_beginning_is_found(
     assert report["frames_with_pose"] == report["frames"] == 40
     assert report["complete"]
     assert report["known_map"] is None
+    assert report["coupling"] is None
     assert report["keyframes"] > before["keyframes"]
     assert report["mesh"][0]["keyframes"] > before["mesh"][0]["keyframes"]
     assert len(read_tum(output / "trajectory.txt")) == 40
@@ -96,7 +97,7 @@ def test_the_first_result_stays_if_the_second_pass_fails(
         raise error
 
     if place != "reach_back":
-        monkeypatch.setattr(module, "_messages", lambda *_: {})
+        monkeypatch.setattr(module, "_messages", lambda *_: ({}, {}))
         monkeypatch.setattr(module, "_record", lambda *_: None)
     monkeypatch.setattr(module, place, ends)
     assert second_pass(output, request, 0) == (130 if isinstance(error, KeyboardInterrupt) else 0)

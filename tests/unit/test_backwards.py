@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 from benchmarks.in_process import true_poses
 from benchmarks.second_pass import Frames, Pass, run
+from inertial_motion import PHONE, Motion, samples_of
 
+from pliant.algorithms.geometry import so3_exp
+from pliant.algorithms.inertial.samples import ImuSamples
+from pliant.algorithms.slam.adjust.inertial_adjustment import CouplingOutcome
 from pliant.algorithms.slam.adjust.loops import Loop
 from pliant.algorithms.slam.atlas.known_places import KnownPlaces
 from pliant.backwards import (
@@ -83,11 +87,13 @@ def without(source: Frames, hidden: Sequence[int]) -> Frames:
     return Frames(camera, frames)
 
 
-def again(source: Frames, first: Pass) -> tuple[MapHistory, Reached]:
+def again(
+    source: Frames, first: Pass, samples: ImuSamples | None = None
+) -> tuple[MapHistory, Reached]:
     history = deepcopy(first.history)
     segments = {frame: segment for frame, (segment, _) in first.poses.items()}
     stretches = lost_stretches(segments, history.stamps_ns)
-    return history, reach_back(source, CONFIG, first.kept, stretches, history)
+    return history, reach_back(source, CONFIG, first.kept, stretches, history, samples)
 
 
 def ate_m(history: MapHistory, truth: Trajectory) -> float:
@@ -138,6 +144,36 @@ def test_segments_that_see_the_same_become_one(tiny: tuple[Frames, Trajectory]) 
     assert len(history.final()) == len(source.frames)
     assert {each.segment for each in reached.kept} == {0}
     assert ate_m(history, truth) < 1e-3
+
+
+def test_samples_move_the_keyframes_of_both_passes() -> None:
+    opened = open_source("built-in:tabletop?width=320")
+    half = [replace(f, index=n) for n, f in enumerate(list(opened)[::2])]
+    source, truth = Frames(opened.calibration, half), true_poses(opened)
+    samples = samples_of(
+        Motion(truth.stamps_ns, truth.T_world_camera), PHONE, np.random.default_rng(1),
+        R_camera_imu=so3_exp(np.array([0.4, 1.0, 2.0])),
+        p_camera_imu=np.array([0.02, -0.01, 0.03]), offset_s=0.08,
+    )  # fmt: skip
+    first = run(without(source, range(20)), CONFIG)
+    assert min(first.poses) == 20
+    by_images, _ = again(source, first)
+    history, reached = again(source, first, samples)
+    assert reached.counters["coupling_outcome"] == CouplingOutcome.MOVED
+    assert reached.counters["coupling_keyframes"] > len(first.kept)
+    assert reached.counters["coupling_moved_m"] > 0.0
+    assert len(history.final()) == len(half)
+    assert ate_m(history, truth) < 1.1 * ate_m(by_images, truth)
+    # Images alone leave the keyframes of the first pass where they were, samples do not.
+    moved = [n for n in history.keyframes if n in first.history.keyframes and n]
+    assert moved
+    for n in moved:
+        before = by_images.keyframes[n].pose_world_camera
+        assert not np.array_equal(history.keyframes[n].pose_world_camera, before)
+    others = replace(samples, gyro_rad_s=samples.gyro_rad_s[::-1].copy())
+    refused, why = again(source, first, others)
+    assert why.counters["coupling_outcome"] == CouplingOutcome.NOT_ALIGNED
+    assert ate_m(refused, truth) < 1.1 * ate_m(by_images, truth)
 
 
 def test_the_same_input_gives_the_same_map(

@@ -21,7 +21,12 @@ from pliant.algorithms.inertial.estimator import bias_walks, own_priors, prior_o
 from pliant.algorithms.inertial.preintegration import preintegrate
 from pliant.algorithms.inertial.residuals import COMMON, OWN, Nodes, State, linearised
 from pliant.algorithms.inertial.samples import ImuSamples
-from pliant.algorithms.slam.adjust.inertial_adjustment import TimedSamples, start_of, with_samples
+from pliant.algorithms.slam.adjust.inertial_adjustment import (
+    CouplingOutcome,
+    TimedSamples,
+    start_of,
+    with_samples,
+)
 from pliant.algorithms.slam.estimate.problem import (
     BundleParameters,
     BundleProblem,
@@ -84,7 +89,7 @@ def coupled(motion: Motion, T: F64, V: F64, samples: ImuSamples) -> Coupled | No
     frames = T[timed.hosts] @ timed.T_host_frame
     aligned = align_inertial(timed.frames_ns, frames, samples)
     assert isinstance(aligned, InertialAlignment), aligned
-    nodes, signal, start = start_of(T, timed, aligned)
+    nodes, signal, start = start_of(T, timed.keyframes_ns, len(T), timed, aligned)
     fixed = np.arange(len(T)) == 0
     return couple(nodes, V, fixed, signal, start, noise_densities(signal), least_px=0.1)
 
@@ -277,6 +282,8 @@ def test_adjustment_with_samples_is_better_and_without_their_own_the_same() -> N
     assert np.array_equal(better.covariance, found.covariance)
     again = with_samples(problem, found, parameters, unsure, timed)
     assert again.T_world_camera.tobytes() == better.T_world_camera.tobytes()
+    assert [each.outcome for each in timed.outcomes] == [CouplingOutcome.MOVED] * 2
+    assert 1e-4 < timed.outcomes[0].moved_m < 0.1
     others = measured(hand_held(30.0, seed=7), 1)
     for wrong in (
         replace(timed, samples=others),
@@ -284,3 +291,40 @@ def test_adjustment_with_samples_is_better_and_without_their_own_the_same() -> N
         replace(timed, samples=ImuSamples.empty()),
     ):
         assert with_samples(problem, found, parameters, unsure, wrong) is found
+        assert timed.outcomes.pop().outcome != CouplingOutcome.MOVED
+
+
+def test_keyframes_come_in_any_order_and_some_twice() -> None:
+    """As of two passes, of which the second reads backwards."""
+    motion = hand_held(30.0, seed=6)
+    problem, _ = drifting_scene(motion, np.random.default_rng(6))
+    parameters, unsure = BundleParameters(), CalibrationUncertainty(readout=0.0)
+    timed, count = timed_samples(motion, measured(motion, 1)), len(problem.T_world_camera)
+    order = np.concatenate([[0], np.arange(count - 1, 0, -1)])
+    place = np.argsort(order)
+
+    def shuffled(array: F64) -> F64:
+        return array[order]
+
+    other = replace(
+        problem, T_world_camera=shuffled(problem.T_world_camera),
+        camera_index=place[problem.camera_index].astype(np.int32),
+        fixed_cameras=problem.fixed_cameras[order], intrinsics=shuffled(problem.intrinsics),
+    )  # fmt: skip
+    turned = replace(
+        timed, keyframes_ns=timed.keyframes_ns[order], hosts=place[timed.hosts],
+        T_host_frame=timed.T_host_frame,
+    )  # fmt: skip
+    found = solve_schur(problem, parameters, uncertainty=unsure, with_covariance=True)
+    in_order = with_samples(problem, found, parameters, unsure, timed).T_world_camera
+    same = replace(found, T_world_camera=shuffled(found.T_world_camera))
+    out_of_order = with_samples(other, same, parameters, unsure, turned).T_world_camera
+    np.testing.assert_allclose(out_of_order, shuffled(in_order), atol=1e-6)
+    assert not np.allclose(out_of_order, same.T_world_camera, atol=1e-5)
+    # Three keyframes that see many landmarks have the times of others: images alone place them.
+    twice, many = timed.keyframes_ns.copy(), np.array([26, 64, 94])
+    twice[many] = twice[many - 1]
+    placed = with_samples(problem, found, parameters, unsure, replace(timed, keyframes_ns=twice))
+    assert timed.outcomes[-1].outcome == CouplingOutcome.MOVED
+    before, true_p = (each.T_world_camera[:, :3, 3] for each in (found, problem))
+    assert error(placed.T_world_camera[:, :3, 3], true_p) < 0.8 * error(before, true_p)

@@ -2,7 +2,7 @@
 
 in   camera/stream    once
      map/known        before the first frame: a map of earlier sessions, to continue in
-     imu/samples      the inertial samples of the source, if they come before the first frame
+     imu/samples      the inertial samples of the source, before the first frame or after the last
      camera/image     every frame: colours, and for re-acquisition patches and maxima of curvature;
                       in live mode, whether to map the frame, or only to localise it by its tracks
      tracks/extrema   every frame
@@ -17,7 +17,6 @@ out  map/update       one per frame: pose, points, keyframes, corrections of ear
 Global bundle adjustment runs in a thread, in parallel with tracking, see ``global_adjustment.py``.
 """
 
-from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeAlias
 
@@ -92,7 +91,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
         return stream, mapper, {}, has_samples and later
 
     # waiting: images and masks of the frames from which a map may yet start, by frame number.
-    # later: samples come after the last frame, too late for any.
+    # later: samples come after the last frame, in time for the last adjustment.
     last, mapper, waiting, later = resume(bus, start)
     extrema = receive(bus, topics.EXTREMA, Extrema)
     worker = AdjustmentWorker()
@@ -133,10 +132,9 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
         last = Header(frame=tracks.frame, stamp_ns=tracks.stamp_ns, frame_id=tracks.frame_id)
         worker.start(mapper.global_adjustment)
         bus.checkpoint(tracks.frame, (last, mapper, waiting, later))
-    if later:
-        deque(bus.receive(topics.IMU), maxlen=0)
+    samples = imu_in(bus.receive(topics.IMU)) if later else None
     with monitor.stage("finish"):
-        final = mapper.finish()
+        final = mapper.finish(samples=samples)
     bus.publish(topics.MAP_FINAL, _update(last, final))
     keyframes = _keyframe(last, mapper.publish_keyframes(), final, waiting)
     bus.publish(topics.KEYFRAME_FINAL, keyframes)

@@ -13,7 +13,7 @@ from pliant.messages.topics import Topic
 from pliant.recording.compare import check_tolerances, compare
 from pliant.recording.parts import parts_of
 from pliant.recording.reader import Recording
-from pliant.recording.summary import summarise
+from pliant.recording.summary import SECOND_PASS, summarise
 from pliant.results import earlier
 from pliant.results.folder import (
     RECORDING_NAME,
@@ -27,7 +27,6 @@ from pliant.results.verdict import summary
 from pliant.results.write import write_results
 from pliant.wording import counted
 from pliant_services.replay.services import (
-    SECOND_PASS,
     Replay,
     gaps,
     recorded_services,

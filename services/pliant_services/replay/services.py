@@ -29,9 +29,6 @@ from pliant_services.processes import PROCESSES, Process, outputs_of
 from pliant_services.replay.ahead import Do, behind, quick_turns, read_ahead
 from pliant_services.runtime.monitor import StatusMonitor
 
-SECOND_PASS = "second_pass"
-"""The metadata record of a recording whose last messages of the map are of two passes."""
-
 
 def replayable(names: Sequence[str]) -> tuple[Process, ...]:
     """The services in the order in which they read each other.  Raises RecordingError."""

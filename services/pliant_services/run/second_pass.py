@@ -34,8 +34,9 @@ from pliant.messages.types import (
     MapUpdate,
     StreamEnd,
 )
+from pliant.recording.measured import imu_of
 from pliant.recording.reader import Recording
-from pliant.recording.summary import summarise
+from pliant.recording.summary import SECOND_PASS, summarise
 from pliant.recording.writer import RecordingWriter
 from pliant.results.folder import CONFIG_NAME, RECORDING_NAME, REPORT_NAME, replace_by
 from pliant.results.judgement import BAD, DOUBTFUL, GOOD
@@ -45,7 +46,7 @@ from pliant.results.write import write_rigid_results
 from pliant.staging import staging
 from pliant.wording import counted
 from pliant_services.processes import BY_NAME
-from pliant_services.replay.services import SECOND_PASS, affected, copied, record
+from pliant_services.replay.services import affected, copied, record
 from pliant_services.run.final_summary import print_summary
 from pliant_services.run.request import RunRequest
 
@@ -74,12 +75,8 @@ def second_pass(output: Path, request: RunRequest, code: int) -> int:
             made.mkdir()
             config = load_config(output / CONFIG_NAME)
             write_whole(made / CONFIG_NAME, (output / CONFIG_NAME).read_bytes())
-            _record(
-                output / RECORDING_NAME,
-                made / RECORDING_NAME,
-                config,
-                _messages(output, request, config, run, stretches),
-            )
+            messages, counters = _messages(output, request, config, run, stretches)
+            _record(output / RECORDING_NAME, made / RECORDING_NAME, config, messages, counters)
             second, first = write_rigid_results(made), _report(output)
             if not is_better(second, first):
                 _say(
@@ -135,8 +132,8 @@ def _posed(report: dict[str, Any]) -> str:
 
 def _messages(
     output: Path, request: RunRequest, config: Config, run: Run, stretches: list[Stretch]
-) -> dict[Topic, list[Header]]:
-    """The last messages of the map, of both passes."""
+) -> tuple[dict[Topic, list[Header]], dict[str, float]]:
+    """The last messages of the map, of both passes, and what inertial samples did."""
     dataset = open_source(request.source, config.ingest)
     recording = Recording(output / RECORDING_NAME)
     known: list[KeptKeyframe] = [
@@ -144,7 +141,8 @@ def _messages(
         for keyframe in recording.decoded(topics.MAP_KEPT)
         if isinstance(keyframe, MapKeyframe)
     ]
-    reached = reach_back(dataset, config, known, stretches, run.history)
+    samples = imu_of(recording)
+    reached = reach_back(dataset, config, known, stretches, run.history, samples)
     (final,) = recording.decoded(topics.MAP_FINAL)
     (rest,) = recording.decoded(topics.KEYFRAME_FINAL)
     assert isinstance(final, MapUpdate)
@@ -155,11 +153,12 @@ def _messages(
         MapKeyframe.of(Header(frame=n, stamp_ns=0, frame_id=WORLD_FRAME_ID), each)
         for n, each in enumerate(reached.kept)
     ]
-    return {
+    messages: dict[Topic, list[Header]] = {
         topics.MAP_FINAL: [MapUpdate.of(header, update, frame_id=WORLD_FRAME_ID)],
         topics.KEYFRAME_FINAL: [_keyframes(rest, reached)],
         topics.MAP_KEPT: [*kept],
     }
+    return messages, {n: v for n, v in reached.counters.items() if n.startswith("coupling_")}
 
 
 def _update(
@@ -205,10 +204,18 @@ def _masks(rest: Keyframe, made: list[bytes]) -> tuple[bytes, ...]:
     return masks if any(masks) else ()
 
 
-def _record(first: Path, path: Path, config: Config, messages: dict[Topic, list[Header]]) -> None:
+def _record(
+    first: Path,
+    path: Path,
+    config: Config,
+    messages: dict[Topic, list[Header]],
+    counters: dict[str, float],
+) -> None:
     """A recording with other last messages of the map, and with a mesh of it where it had one."""
     recording, summary = Recording(first), summarise(first)
-    metadata = {**summary.metadata, SECOND_PASS: {"topics": " ".join(t.key for t in _LAST)}}
+    about = {"topics": " ".join(topic.key for topic in _LAST)}
+    about |= {name: repr(float(value)) for name, value in counters.items()}
+    metadata = {**summary.metadata, SECOND_PASS: about}
     stale = {topic.key for topic in _LAST} | affected([_MESHING])
     with RecordingWriter(path, metadata) as writer:
         copied(recording, summary, stale, writer)

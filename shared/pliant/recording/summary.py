@@ -14,6 +14,9 @@ from pliant.recording.reader import Recorded, Recording
 from pliant.recording.scan import Closed, Damage
 from pliant.wording import counted
 
+SECOND_PASS = "second_pass"
+"""The metadata record of a recording whose last messages of the map are of two passes."""
+
 _SEQUENCES = 1 << 32  # MCAP counts with 32 bits
 
 

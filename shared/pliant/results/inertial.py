@@ -1,12 +1,46 @@
-"""The scale and the vertical of a result from the inertial samples of its source."""
+"""The scale and the vertical of a result from the inertial samples of its source, and what these
+did to its keyframes."""
+
+from typing import Any
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.inertial.alignment import Refusal, align_inertial
 from pliant.algorithms.inertial.samples import ImuSamples
+from pliant.algorithms.slam.adjust.inertial_adjustment import CouplingOutcome
 from pliant.map_history import MapHistory
+from pliant.recording.summary import SECOND_PASS
 from pliant.results.known_scale import Scale, level_of
+from pliant.results.run import Run
+
+_REFUSALS = {
+    CouplingOutcome.NOT_ALIGNED: "they do not fit the keyframes",
+    CouplingOutcome.UNKNOWN_TIMES: "the map continues a saved one, or has a single keyframe",
+    CouplingOutcome.TOO_MANY: "there are more than 600 keyframes",
+    CouplingOutcome.FOCAL_CHANGES: "the focal length changes",
+    CouplingOutcome.DIVERGED: "the estimate does not converge",
+    CouplingOutcome.TOO_NOISY: "the residuals are more than ten times the noise",
+    CouplingOutcome.IMAGES_DISAGREE: "the reprojection errors would grow more than predicted",
+    CouplingOutcome.CALIBRATION_FIXED: "the calibration is fixed",
+}
+
+
+def coupling_of(run: Run) -> dict[str, Any] | None:
+    """What inertial samples did to the keyframes of the largest segment; None if there are none.
+
+    keyframes: of the segment.   moved_mm: median of their motion.   refusal: why they stayed.
+    """
+    second = run.recorded.metadata.get(SECOND_PASS, {})
+    counters = dict(run.counters.get("bundle_adjustment", {}))
+    counters |= {n: float(value) for n, value in second.items() if n.startswith("coupling_")}
+    if "coupling_outcome" not in counters:
+        return None
+    return {
+        "keyframes": int(counters["coupling_keyframes"]),
+        "moved_mm": round(1e3 * counters["coupling_moved_m"], 4),
+        "refusal": _REFUSALS.get(CouplingOutcome(int(counters["coupling_outcome"])), ""),
+    }
 
 
 def by_samples(history: MapHistory, samples: ImuSamples) -> Scale | str:

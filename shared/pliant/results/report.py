@@ -17,6 +17,7 @@ from pliant.results.calibration import (
     focal_changes,
     focal_sigma,
 )
+from pliant.results.inertial import coupling_of
 from pliant.results.judgement import doubtful_frames, judge
 from pliant.results.mesh_files import mesh_report
 from pliant.results.run import Run
@@ -93,6 +94,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "z_is_up": run.z_is_up,
         "scale": None if run.scale is None else run.scale.content(),
         "inertial_refusal": run.inertial_refusal,
+        "coupling": coupling_of(run),
         "gps_refusal": run.gps_refusal,
     }
 

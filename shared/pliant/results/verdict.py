@@ -52,6 +52,7 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
     ]
     lines += _gyro_lines(report)
     lines += _scale_lines(report)
+    lines += _coupling_lines(report)
     lens = report.get("calibration_verdict")
     lines += [lens] if lens and lens != report["verdict_reason"] else []
     lines += _faults(report)
@@ -102,6 +103,17 @@ def _scale_lines(report: dict[str, Any]) -> list[str]:
     sensors = {"inertial samples": "inertial_refusal", "satellite fixes": "gps_refusal"}
     refusals = {sensor: report.get(key) for sensor, key in sensors.items()}
     return lines + [f"{sensor} not used: {why}" for sensor, why in refusals.items() if why]
+
+
+def _coupling_lines(report: dict[str, Any]) -> list[str]:
+    """A line about what inertial samples did to keyframes, unless their refusal is known."""
+    coupling = report.get("coupling")
+    if coupling is None or report.get("inertial_refusal"):
+        return []
+    if coupling["refusal"]:
+        return [f"inertial samples did not move the keyframes: {coupling['refusal']}"]
+    moved = f"{counted(coupling['keyframes'], 'keyframe')} by {coupling['moved_mm']:.2g} mm"
+    return [f"inertial samples moved {moved} in the median"]
 
 
 def _gyro_lines(report: dict[str, Any]) -> list[str]:

@@ -146,12 +146,17 @@ def inertial(
         str | None,
         typer.Option(help="Instead, the poses of --run with a gyro and without: dark or seen."),
     ] = None,
+    coupled: Annotated[
+        bool, typer.Option(help="Instead, the maps of --run after samples have moved keyframes.")
+    ] = False,
 ) -> None:
     """Scale, vertical, offset and rotation from inertial samples, and what wrong ones come to.
 
     scripts/bench inertial euroc_gt_leftcam --run tabletop --run V102
     scripts/bench inertial --run room --gyro dark
+    scripts/bench inertial euroc_gt_leftcam --run V102 --coupled
     """
+    from benchmarks.coupled import measure as at_the_end
     from benchmarks.dark_turns import compare
     from benchmarks.dark_turns import measure as in_the_dark
     from benchmarks.inertial import measure
@@ -159,5 +164,8 @@ def inertial(
     if gyro is not None:
         with_gyro = in_the_dark if gyro == "dark" else compare
         show(with_gyro(motions, runs or [], frames, seeds))
+        return
+    if coupled:
+        show(at_the_end(motions, runs or [], frames, seeds))
         return
     show(measure(motions, only=only or [], runs=runs or [], frames=frames, seeds=seeds))

@@ -109,7 +109,7 @@ def _with_gauge(information: F64, nodes: Nodes, held: BoolArray) -> F64:
     visual = information.copy()
     typical = float(np.trace(visual)) / len(visual)
     along = np.zeros((count, 6))
-    along[:, 3:] = nodes.p - nodes.p[0]
+    along[:, 3:] = nodes.p - nodes.p[int(np.argmax(held))]
     unit = along.ravel() / max(float(np.linalg.norm(along)), 1e-12)
     visual += typical * np.outer(unit, unit)
     own = (6 * np.flatnonzero(held)[:, None] + _POSE).ravel()

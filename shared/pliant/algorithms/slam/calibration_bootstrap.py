@@ -112,15 +112,15 @@ class BootstrapMapper:
         return 0 if self._on_trial else self._mapper.point_count
 
     @property
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> dict[str, float]:
         """As ``Mapper.counters``."""
         return {} if self._on_trial else self._mapper.counters
 
-    def finish(self, timer: StageTimer = no_stages) -> MapDelta:
+    def finish(self, timer: StageTimer = no_stages, samples: ImuSamples | None = None) -> MapDelta:
         """As ``Mapper.finish``; a trial still running ends first."""
         if self._on_trial and (self._first is not None or self._mapper.start_at_last()):
             self._map_all_taken(no_stages)
-        return self._mapper.finish(timer)
+        return self._mapper.finish(timer, samples)
 
     def kept(self) -> Iterator[KeptKeyframe]:
         """As ``Mapper.kept``; the loaded map if the trial found none."""

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from typing import Protocol
 
+from pliant.algorithms.inertial.samples import ImuSamples
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment
 from pliant.algorithms.slam.frame import Frame
@@ -32,8 +33,11 @@ class FrameMapper(Protocol):
         """Skip a frame without pixels or without time: it gets no pose."""
         ...
 
-    def finish(self, timer: StageTimer = no_stages) -> MapDelta:
-        """Return the last corrections, after the last frame."""
+    def finish(self, timer: StageTimer = no_stages, samples: ImuSamples | None = None) -> MapDelta:
+        """Return the last corrections, after the last frame.
+
+        samples: inertial, of the whole source, that came meanwhile.
+        """
         ...
 
     def publish_keyframes(self) -> KeyframeDelta:
@@ -60,6 +64,6 @@ class FrameMapper(Protocol):
         ...
 
     @property
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> dict[str, float]:
         """Counts for the summary of a run."""
         return {}

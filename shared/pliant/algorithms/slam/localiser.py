@@ -13,6 +13,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log, transform
+from pliant.algorithms.inertial.samples import ImuSamples
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.slam.active.active_map import ActiveMap
 from pliant.algorithms.slam.active.frame_pose import (
@@ -136,8 +137,8 @@ class Localiser(FrameMapper):
         """Number of landmarks in the map."""
         return int(np.count_nonzero(self._points.state == MAPPED))
 
-    def finish(self, timer: StageTimer = no_stages) -> MapDelta:
-        """As ``Mapper.finish``."""
+    def finish(self, timer: StageTimer = no_stages, samples: ImuSamples | None = None) -> MapDelta:
+        """As ``Mapper.finish``; samples do not change a loaded map."""
         return self._publish(WAITING if self._map is None else TRACKING, "", 0)
 
     def publish_keyframes(self) -> KeyframeDelta:

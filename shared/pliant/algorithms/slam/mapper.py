@@ -27,8 +27,9 @@ from pliant.algorithms.slam.active.frame_pose import (
 from pliant.algorithms.slam.active.frame_turns import FrameTurns
 from pliant.algorithms.slam.active.tracked_pose import pose_by_tracks
 from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment
+from pliant.algorithms.slam.adjust.inertial_adjustment import Coupling
 from pliant.algorithms.slam.adjust.ordinary_frames import STANDING_ROOMS
-from pliant.algorithms.slam.adjust.segment import InertialSource, Moved, Segment
+from pliant.algorithms.slam.adjust.segment import InertialSource, Moved, PlacedFrames, Segment
 from pliant.algorithms.slam.atlas.atlas import Atlas
 from pliant.algorithms.slam.atlas.pose_history import PoseHistory
 from pliant.algorithms.slam.atlas.publisher import Publisher
@@ -86,6 +87,7 @@ class Mapper:
         self._motion = Motion.at(0, 0, np.eye(4))  # in the active segment
         self._turns = FrameTurns.of(samples)
         self._samples = samples
+        self._couplings: list[Coupling] = []
         self._lost_frames = 0
         self._keyframe_ns = 0
         self._keyframe_is_new = False
@@ -146,11 +148,24 @@ class Mapper:
         """
         return self.publish(self._skipped(reason))
 
-    def finish(self, timer: StageTimer = no_stages) -> MapDelta:
-        """Apply the remaining corrections at the end of the stream."""
+    def finish(
+        self,
+        timer: StageTimer = no_stages,
+        samples: ImuSamples | None = None,
+        placed: PlacedFrames | None = None,
+    ) -> MapDelta:
+        """Apply the remaining corrections at the end of the stream.
+
+        samples: inertial, that came too late for ``__init__``.   placed: frames that they are
+        compared with; None: those of this mapper.
+        """
         self.start_at_last()
-        samples = self._samples
-        inertial = None if samples is None else InertialSource(samples, self._poses.stamps_ns)
+        samples, stamps_ns = samples or self._samples, self._poses.stamps_ns
+        self._couplings = []
+        inertial = (
+            None if samples is None or not len(samples.stamps_ns)
+            else InertialSource(samples, stamps_ns, self._couplings, placed)
+        )  # fmt: skip
         self.follow(self.atlas.finish(timer, inertial))
         with timer("skipped frames"):
             for segment, seen_by in self.atlas.everything():
@@ -375,7 +390,14 @@ class Mapper:
         return self.atlas.point_count
 
     @property
-    def counters(self) -> dict[str, int]:
-        """Results of place comparisons, and numbers of dropped keyframes and landmarks."""
-        atlas = self.atlas
-        return atlas.places.comparisons.counters | atlas.dropped | self._turns.counters
+    def counters(self) -> dict[str, float]:
+        """Results of place comparisons, numbers of dropped keyframes and landmarks, and what
+        inertial samples did.
+        """
+        atlas, coupled = self.atlas, dict[str, float]()
+        if self._couplings:  # of the largest segment
+            most = max(self._couplings, key=lambda each: each.keyframes)
+            coupled = {f"coupling_{name}": value for name, value in vars(most).items()}
+        return {
+            **atlas.places.comparisons.counters, **atlas.dropped, **self._turns.counters, **coupled
+        }  # fmt: skip

@@ -12,7 +12,12 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.slam.adjust.inertial_adjustment import TimedSamples, with_samples
+from pliant.algorithms.slam.adjust.inertial_adjustment import (
+    Coupling,
+    CouplingOutcome,
+    TimedSamples,
+    with_samples,
+)
 from pliant.algorithms.slam.calibration.changing_focal import evidence_of_change, gaps_s, walk_from
 from pliant.algorithms.slam.calibration.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.slam.calibration.focal_search import best_along_focal
@@ -264,6 +269,10 @@ def adjust_list(
             found = other if confirmed else found
     if timed is not None and uncertainty is not None and not len(found.log_focal):
         found = with_samples(problem, found, bundle, uncertainty, timed)
+    elif timed is not None:
+        fixed, changes = CouplingOutcome.CALIBRATION_FIXED, CouplingOutcome.FOCAL_CHANGES
+        outcome = fixed if uncertainty is None else changes
+        timed.outcomes.append(Coupling(outcome=outcome, keyframes=len(seen.T_world_camera)))
     if varying:
         seen.log_focal = found.log_focal if len(found.log_focal) else 0.0 * seen.log_focal
     seen.xyz[chosen] = found.points_world

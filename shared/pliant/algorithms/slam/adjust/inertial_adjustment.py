@@ -5,7 +5,8 @@ alignment accepts them, the poses are estimated once more, by the information of
 and by the samples between keyframes (``inertial.coupling``).  Landmarks and calibration follow.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
 
 import numpy as np
 
@@ -41,12 +42,36 @@ _AS_PREDICTED = 2.0
 """Growth of the images' cost, relative to that of its parabola, which does not hold beyond it."""
 
 
+class CouplingOutcome(IntEnum):
+    """Whether the samples moved the keyframes of a segment, or why not."""
+
+    MOVED = 0
+    NOT_ALIGNED = 1
+    UNKNOWN_TIMES = 2
+    TOO_MANY = 3
+    FOCAL_CHANGES = 4
+    DIVERGED = 5
+    TOO_NOISY = 6
+    IMAGES_DISAGREE = 7
+    CALIBRATION_FIXED = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Coupling:
+    """keyframes: of a segment.   moved_m: median by which the samples moved them, in metres."""
+
+    outcome: CouplingOutcome
+    keyframes: int
+    moved_m: float = 0.0
+
+
 @dataclass(frozen=True, kw_only=True)
 class TimedSamples:
     """Inertial samples of the whole source, and when M keyframes and F frames were captured.
 
-    keyframes_ns: (M,).   frames_ns: (F,), ascending.   hosts: (F,) the keyframe of each frame, and
-    T_host_frame (F, 4, 4) its pose relative to it.
+    keyframes_ns: (M,), -1: unknown.   frames_ns: (F,), ascending.   hosts: (F,) the keyframe of
+    each frame, and T_host_frame (F, 4, 4) its pose relative to it.
+    outcomes: receives what came of each adjustment.
     """
 
     samples: ImuSamples
@@ -54,6 +79,7 @@ class TimedSamples:
     frames_ns: I64
     hosts: I64
     T_host_frame: F64
+    outcomes: list[Coupling] = field(default_factory=list[Coupling])
 
 
 def with_samples(
@@ -61,25 +87,50 @@ def with_samples(
     uncertainty: CalibrationUncertainty, timed: TimedSamples,
 ) -> BundleResult:  # fmt: skip
     """Return the adjustment after the samples, or as it was where they do not improve it."""
-    times_ns, T = timed.keyframes_ns, found.T_world_camera
-    if not 2 <= len(T) <= _MOST_KEYFRAMES or times_ns.min() < 0 or (np.diff(times_ns) <= 0).any():
-        return found
+    after, metres_per_unit = found, 0.0
+    outcome = _fault(found.T_world_camera, timed)
+    if outcome is None:
+        outcome, after, metres_per_unit = _coupled(problem, found, parameters, uncertainty, timed)
+    moved = np.linalg.norm((after.T_world_camera - found.T_world_camera)[:, :3, 3], axis=1)
+    moved_m = metres_per_unit * float(np.median(moved))
+    timed.outcomes.append(Coupling(outcome=outcome, keyframes=len(moved), moved_m=moved_m))
+    return after
+
+
+def _fault(T: F64, timed: TimedSamples) -> CouplingOutcome | None:
+    if len(T) > _MOST_KEYFRAMES:
+        return CouplingOutcome.TOO_MANY
+    if len(np.unique(timed.keyframes_ns)) < 2 or timed.keyframes_ns.min() < 0:
+        return CouplingOutcome.UNKNOWN_TIMES
+    return None
+
+
+def _coupled(
+    problem: BundleProblem, found: BundleResult, parameters: BundleParameters,
+    uncertainty: CalibrationUncertainty, timed: TimedSamples,
+) -> tuple[CouplingOutcome, BundleResult, float]:  # fmt: skip
+    """The outcome, the adjustment, and metres of a unit."""
+    T = found.T_world_camera
     frames = T[timed.hosts] @ timed.T_host_frame
     aligned = align_inertial(timed.frames_ns, frames, timed.samples)
     least_px = float(np.sqrt(found.residual_variance(problem)))
     if not isinstance(aligned, InertialAlignment) or least_px == 0.0:
-        return found
+        return CouplingOutcome.NOT_ALIGNED, found, 0.0
+    order, chained = _in_time(timed.keyframes_ns)
+    columns = (6 * order[:, None] + np.arange(6)).ravel()
     information = system_at(problem, found, parameters, uncertainty).pose_information()
-    nodes, signal, start = start_of(T, timed, aligned)
+    nodes, signal, start = start_of(T[order], timed.keyframes_ns[order], chained, timed, aligned)
     coupled = couple(
-        nodes, information, problem.fixed_cameras, signal, start, noise_densities(signal),
-        least_px=least_px,
+        nodes, information[np.ix_(columns, columns)], problem.fixed_cameras[order], signal, start,
+        noise_densities(signal), least_px=least_px,
     )  # fmt: skip
-    if coupled is None or max(coupled.pixel_sigma, coupled.inertial_sigma) > _MOST_SIGMA:
-        return found
+    if coupled is None:
+        return CouplingOutcome.DIVERGED, found, 0.0
+    if max(coupled.pixel_sigma, coupled.inertial_sigma) > _MOST_SIGMA:
+        return CouplingOutcome.TOO_NOISY, found, 0.0
     poses = T.copy()
-    free = ~problem.fixed_cameras
-    poses[free, :3, :3], poses[free, :3, 3] = coupled.state.R[free], coupled.state.p[free]
+    poses[order, :3, :3], poses[order, :3, 3] = coupled.state.R, coupled.state.p
+    poses[problem.fixed_cameras] = T[problem.fixed_cameras]
     held = replace(
         problem, T_world_camera=poses, points_world=found.points_world,
         fixed_cameras=np.ones(len(T), np.bool_),
@@ -88,27 +139,45 @@ def with_samples(
         held, parameters, uncertainty=uncertainty, start=found.correction, doubled=True
     )
     if after.final_cost - found.final_cost > _AS_PREDICTED * coupled.cost:
-        return found
-    return replace(after, covariance=found.covariance)
+        return CouplingOutcome.IMAGES_DISAGREE, found, 0.0
+    moved = replace(after, covariance=found.covariance)
+    return CouplingOutcome.MOVED, moved, coupled.state.scale
+
+
+def _in_time(times_ns: I64) -> tuple[I64, int]:
+    """Rows (M,) in order of time, and the number of the first of them that differ in time.
+
+    Two passes make two keyframes of a frame that both read.  Samples tie the first of these only,
+    and images tie the other to it.
+    """
+    first = np.unique(times_ns, return_index=True)[1]
+    rest = np.setdiff1d(np.arange(len(times_ns)), first)
+    return np.concatenate([first, rest]), len(first)
 
 
 def start_of(
-    T: F64, timed: TimedSamples, aligned: InertialAlignment
+    T: F64, times_ns: I64, chained: int, timed: TimedSamples, aligned: InertialAlignment
 ) -> tuple[Nodes, ImuSignal, State]:
-    """Return the keyframes with poses T (M, 4, 4) as nodes, the samples in seconds after the first
-    of them, and the state by the alignment.
+    """Return keyframes as nodes, the samples in seconds after the first of them, and the state by
+    the alignment.
+
+    T: (M, 4, 4), and times_ns (M,), ascending for the first ``chained`` keyframes.  Samples tie
+    none of the others.
     """
-    origin_ns, count = int(timed.keyframes_ns[0]), len(T)
-    times_s = np.float64(1e-9) * (timed.keyframes_ns - origin_ns)
+    origin_ns, count = int(times_ns[0]), len(T)
+    times_s = np.float64(1e-9) * (times_ns - origin_ns)
     signal = averaged_signal(timed.samples, origin_ns)
-    at = times_s + aligned.time_offset_s
-    tied = signal.covers(at[:-1] - _AROUND_S, at[1:] + _AROUND_S, longest_gap_s(signal))
-    tied &= np.diff(times_s) <= _LONGEST_S
+    at = times_s[:chained] + aligned.time_offset_s
+    tied = np.zeros(count - 1, np.bool_)
+    covered = signal.covers(at[:-1] - _AROUND_S, at[1:] + _AROUND_S, longest_gap_s(signal))
+    tied[: chained - 1] = covered & (np.diff(at) <= _LONGEST_S)
     R, p = T[:, :3, :3], T[:, :3, 3]
+    v = np.zeros((count, 3))
+    v[:chained] = aligned.metres_per_unit * np.gradient(p[:chained], times_s[:chained], axis=0)
     start = State(
         R=R,
         p=p,
-        v=aligned.metres_per_unit * np.gradient(p, times_s, axis=0),
+        v=v,
         scale=aligned.metres_per_unit,
         gravity=-GRAVITY_M_S2 * aligned.up,
         R_camera_imu=aligned.R_camera_imu,

@@ -33,7 +33,7 @@ from pliant.algorithms.geometry import (
 from pliant.algorithms.inertial.samples import ImuSamples
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.slam.adjust.final_adjustment import adjust_keyframes
-from pliant.algorithms.slam.adjust.inertial_adjustment import TimedSamples
+from pliant.algorithms.slam.adjust.inertial_adjustment import Coupling, TimedSamples
 from pliant.algorithms.slam.adjust.ordinary_frames import OrdinaryFrames
 from pliant.algorithms.slam.calibration.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.slam.calibration.rolling_shutter import FramePoses, RolledFrame
@@ -140,11 +140,36 @@ class Moved(NamedTuple):
     same_places: tuple[tuple[int, int], ...] = ()
 
 
+class PlacedFrames(NamedTuple):
+    """Frames that several passes have placed, on the clock of the samples.
+
+    keyframes_ns: capture times of keyframes by their ids.   stamps_ns: (F,) of frames, ascending.
+    hosts: (F,) ids of their keyframes, and T_host_frame (F, 4, 4) their poses relative to these.
+    """
+
+    keyframes_ns: dict[int, int]
+    stamps_ns: I64
+    hosts: I64
+    T_host_frame: F64
+
+    def on(self, keyframes: list[Keyframe]) -> "PlacedFrames":
+        """Return those of these keyframes."""
+        of = np.isin(self.hosts, [keyframe.id for keyframe in keyframes])
+        return self._replace(
+            stamps_ns=self.stamps_ns[of], hosts=self.hosts[of], T_host_frame=self.T_host_frame[of]
+        )
+
+
 class InertialSource(NamedTuple):
-    """Inertial samples of a whole source, and the capture times of its frames."""
+    """Inertial samples of a whole source, and the capture times of its frames.
+
+    placed: instead of the frames and times of the segment.   outcomes: receives what came of them.
+    """
 
     samples: ImuSamples
     stamps_ns: dict[int, int]
+    outcomes: list[Coupling]
+    placed: PlacedFrames | None = None
 
 
 @dataclass(kw_only=True)
@@ -234,16 +259,28 @@ class Segment:
     def _timed(self, inertial: InertialSource | None) -> TimedSamples | None:
         if inertial is None:
             return None
-        frames, T_world_camera, _ = self.path.frames_on(self.keyframes)
-        number = {keyframe.id: n for n, keyframe in enumerate(self.keyframes)}
-        hosts = np.array([number[each.keyframe.id] for each in frames], np.int64)
-        T_world_host = np.array([keyframe.T_world_camera for keyframe in self.keyframes])[hosts]
+        placed = inertial.placed
+        placed = self._placed(inertial) if placed is None else placed.on(self.keyframes)
+        ids = np.array([keyframe.id for keyframe in self.keyframes], np.int64)
+        times_ns = [placed.keyframes_ns.get(each, -1) for each in ids.tolist()]
+        order = np.argsort(ids)
         return TimedSamples(
             samples=inertial.samples,
-            keyframes_ns=np.array([keyframe.stamp_ns for keyframe in self.keyframes], np.int64),
-            frames_ns=np.array([inertial.stamps_ns[each.frame] for each in frames], np.int64),
-            hosts=hosts,
-            T_host_frame=inverse(T_world_host) @ T_world_camera,
+            keyframes_ns=np.array(times_ns, np.int64),
+            frames_ns=placed.stamps_ns,
+            hosts=order[np.searchsorted(ids[order], placed.hosts)],
+            T_host_frame=placed.T_host_frame,
+            outcomes=inertial.outcomes,
+        )
+
+    def _placed(self, inertial: InertialSource) -> PlacedFrames:
+        frames, T_world_camera, _ = self.path.frames_on(self.keyframes)
+        T_world_host = np.array([each.keyframe.T_world_camera for each in frames])
+        return PlacedFrames(
+            keyframes_ns={keyframe.id: keyframe.stamp_ns for keyframe in self.keyframes},
+            stamps_ns=np.array([inertial.stamps_ns[each.frame] for each in frames], np.int64),
+            hosts=np.array([each.keyframe.id for each in frames], np.int64),
+            T_host_frame=inverse(T_world_host.reshape(-1, 4, 4)) @ T_world_camera,
         )
 
     def move(self, moves: MapMoves) -> F64:
