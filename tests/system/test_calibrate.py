@@ -44,7 +44,7 @@ def test_a_camera_is_found_without_a_board(tmp_path: Path) -> None:
     black[:44] = 255
     cv2.imwrite(str(tmp_path / "mask.png"), black)
     anew = tmp_path / "masked.yaml"
-    film = enlarged(builtin_folder(TINY), tmp_path / "film")
+    film = enlarged(builtin_folder(f"{TINY}?frames=24"), tmp_path / "film")
     masked = pliant(
         "calibrate", film, "--fov", "50", "--mask", tmp_path / "mask.png", "--output", anew
     )

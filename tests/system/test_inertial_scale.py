@@ -19,8 +19,8 @@ from pliant.recording.map_file import MapFile
 pytestmark = pytest.mark.system
 
 SOURCE = "built-in:tabletop?width=320"
-HALF = (SOURCE, "--every", "2", *NO_MESH)
-"""Every second frame is enough for all that is tested."""
+QUARTER = (SOURCE, "--every", "4", *NO_MESH)
+"""Every fourth frame is enough for all that is tested."""
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def samples() -> ImuSamples:
 def metric(samples: ImuSamples, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("metric")
     imu = write_imu_csv(folder / "imu.csv", samples)
-    done = pliant("run", *HALF, "--imu", imu, "--output", folder / "result")
+    done = pliant("run", *QUARTER, "--imu", imu, "--output", folder / "result")
     assert done.returncode == 0, done.stderr
     assert "in metres by inertial samples of 8 s" in done.stdout
     return folder / "result"
@@ -53,7 +53,7 @@ def refused(samples: ImuSamples, tmp_path_factory: pytest.TempPathFactory) -> Pa
         accel_m_s2=samples.accel_m_s2[:, [1, 0, 2]],
     )
     imu = write_imu_csv(folder / "imu.csv", mirrored)
-    done = pliant("run", *HALF, "--imu", imu, "--output", folder / "result")
+    done = pliant("run", *QUARTER, "--imu", imu, "--output", folder / "result")
     assert done.returncode == 0, done.stderr
     assert "inertial samples not used: the axes of the gyro are left-handed" in done.stdout
     return folder / "result"
@@ -89,7 +89,7 @@ def test_a_refusal_leaves_the_result_as_it_is(refused: Path, tmp_path: Path) -> 
     assert report["scale"] is None
     assert report["inertial_refusal"].startswith("the axes of the gyro are left-handed")
     assert not (refused / "scale.yaml").exists()
-    done = pliant("run", *HALF, "--output", tmp_path / "without")
+    done = pliant("run", *QUARTER, "--output", tmp_path / "without")
     assert done.returncode == 0, done.stderr
     assert digests(refused) == digests(tmp_path / "without")
 

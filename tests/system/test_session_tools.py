@@ -70,7 +70,7 @@ def test_status_and_stop_of_a_session_in_parts(endpoint: str, tmp_path) -> None:
         }
         rows: dict[str, str] = {}
         while not set(services) <= set(rows):  # they come up by and by
-            shown = pliant("status", "--connect", endpoint, "--session", "lab")
+            shown = in_this_process("status", "--connect", endpoint, "--session", "lab")
             rows = {line.split()[1]: line for line in shown.stdout.splitlines()[1:]}
             assert all(service.poll() is None for service in services.values())
         assert rows["tracking"].startswith("lab ")
@@ -109,7 +109,7 @@ def test_a_run_is_found_by_its_result_folder(tmp_path: Path) -> None:
     with start("run", long_source(tmp_path), *NO_MESH, "--output", str(result)) as run:
         rows: set[str] = set()
         while not ({"ingest", "recorder"} <= rows and has_frames(result)):
-            shown = pliant("status", str(result), "--seconds", "1.5")
+            shown = in_this_process("status", str(result), "--seconds", "1.5")
             rows = {line.split()[1] for line in shown.stdout.splitlines()[1:]}
             assert run.poll() is None
         endpoint = json.loads((result / "session.json").read_text())["endpoint"]
