@@ -39,7 +39,7 @@ def metric(samples: ImuSamples, tmp_path_factory: pytest.TempPathFactory) -> Pat
     imu = write_imu_csv(folder / "imu.csv", samples)
     done = pliant("run", *QUARTER, "--imu", imu, "--output", folder / "result")
     assert done.returncode == 0, done.stderr
-    assert "in metres by inertial samples of 8 s" in done.stdout
+    assert "in metres by inertial samples of 7 s" in done.stdout
     return folder / "result"
 
 

@@ -39,7 +39,7 @@ def test_a_run_continues_in_a_map_and_replays(office: Path, tmp_path: Path) -> N
     told = in_this_process("map", "info", tmp_path / "today")
     assert "sessions: 2" in told.stdout
 
-    again = pliant("replay", tmp_path / "today", "--check", "--output", tmp_path / "again")
+    again = in_this_process("replay", tmp_path / "today", "--check", "--output", tmp_path / "again")
     assert again.returncode == 0, again.stdout
     assert "map/kept" in again.stdout
     kept = [tmp_path / name / "map.pliant" for name in ("today", "again")]

@@ -125,7 +125,7 @@ def test_what_is_left_out_is_dark_to_the_eye(result: Path, bonnet: Path, tmp_pat
 
 
 def test_its_replay_gives_the_same_bytes(result: Path, tmp_path: Path) -> None:
-    done = pliant("replay", result, "--check", "--output", tmp_path / "again")
+    done = in_this_process("replay", result, "--check", "--output", tmp_path / "again")
     assert done.returncode == 0, done.stdout + done.stderr
 
 

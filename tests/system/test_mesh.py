@@ -177,7 +177,7 @@ def test_a_voxel_too_small_for_the_memory_is_refused_before_the_work(
 
 def test_the_service_replays_to_the_same_bytes(result: Path, tmp_path: Path) -> None:
     arguments = ("--services", "meshing", "--check", "--output", tmp_path / "again")
-    done = pliant("replay", result, *arguments)
+    done = in_this_process("replay", result, *arguments)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "the same bytes as recorded: mesh/blocks, mesh/final" in done.stdout
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from benchmarks.recorder_kills import measure
-from running import AS_FROM_A_SHELL, NO_MESH, TINY, pliant
+from running import AS_FROM_A_SHELL, NO_MESH, TINY, in_this_process, pliant
 
 from pliant.config import config_yaml, load_config
 from pliant.messages import topics
@@ -95,7 +95,7 @@ def test_a_recording_without_images_lists_what_cannot_be_replayed(tmp_path: Path
     summary = summarise(folder)
     assert summary.complete
     assert topics.SOURCE.key not in summary.topics
-    done = pliant("replay", folder, "--services", "tracking")
+    done = in_this_process("replay", folder, "--services", "tracking")
     assert done.returncode == 1
     assert "tracking cannot be replayed: the recording is without camera/source" in done.stderr
 

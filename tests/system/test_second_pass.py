@@ -74,7 +74,9 @@ def test_what_was_lost_at_the_beginning_is_found(
     assert contents(output).keys() == known.keys()  # nothing of the first stays, nothing beside it
 
     for services, same in ((), "tracks/extrema"), (("--services", "meshing"), "mesh/final"):
-        done = pliant("replay", output, "--check", *services, "--output", tmp_path / "r", "--force")
+        done = in_this_process(
+            "replay", output, "--check", *services, "--output", tmp_path / "r", "--force"
+        )
         assert done.returncode == 0, done.stdout + done.stderr
         assert same in done.stdout
         assert ("two passes" in done.stderr) == (not services)
