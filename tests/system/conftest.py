@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from running import COARSE_MESH, TINY, pliant
+from running import COARSE_MESH, TINY, in_this_process
 
 
 @pytest.fixture(scope="session")
@@ -22,7 +22,7 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with shared.with_suffix(".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not shared.exists():
-            done = pliant("run", TINY, *COARSE_MESH, "--output", folder)
+            done = in_this_process("run", TINY, *COARSE_MESH, "--output", folder)
             assert done.returncode == 0, done.stderr
             (folder / "logs" / "stdout").write_text(done.stdout)
             folder.rename(shared)

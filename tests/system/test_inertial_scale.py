@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from inertial_motion import PHONE, Motion, samples_of
-from running import NO_MESH, assert_one_line, digests, in_this_process, pliant
+from running import NO_MESH, assert_one_line, digests, in_this_process
 from sample_files import write_imu_csv
 
 from pliant.algorithms.geometry import align_umeyama, so3_exp
@@ -37,7 +37,7 @@ def samples() -> ImuSamples:
 def metric(samples: ImuSamples, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("metric")
     imu = write_imu_csv(folder / "imu.csv", samples)
-    done = pliant("run", *QUARTER, "--imu", imu, "--output", folder / "result")
+    done = in_this_process("run", *QUARTER, "--imu", imu, "--output", folder / "result")
     assert done.returncode == 0, done.stderr
     assert "in metres by inertial samples of 7 s" in done.stdout
     return folder / "result"
@@ -53,7 +53,7 @@ def refused(samples: ImuSamples, tmp_path_factory: pytest.TempPathFactory) -> Pa
         accel_m_s2=samples.accel_m_s2[:, [1, 0, 2]],
     )
     imu = write_imu_csv(folder / "imu.csv", mirrored)
-    done = pliant("run", *QUARTER, "--imu", imu, "--output", folder / "result")
+    done = in_this_process("run", *QUARTER, "--imu", imu, "--output", folder / "result")
     assert done.returncode == 0, done.stderr
     assert "inertial samples not used: the axes of the gyro are left-handed" in done.stdout
     return folder / "result"
@@ -89,7 +89,7 @@ def test_a_refusal_leaves_the_result_as_it_is(refused: Path, tmp_path: Path) -> 
     assert report["scale"] is None
     assert report["inertial_refusal"].startswith("the axes of the gyro are left-handed")
     assert not (refused / "scale.yaml").exists()
-    done = pliant("run", *QUARTER, "--output", tmp_path / "without")
+    done = in_this_process("run", *QUARTER, "--output", tmp_path / "without")
     assert done.returncode == 0, done.stderr
     assert digests(refused) == digests(tmp_path / "without")
 
@@ -116,7 +116,7 @@ def test_more_samples_than_fit_in_the_window_of_the_bus(tmp_path: Path) -> None:
         accel_m_s2=rng.normal((0.0, 0.0, 9.81), 1.0, (count, 3)),
     )
     imu = write_imu_csv(tmp_path / "imu.csv", many)
-    done = pliant(
+    done = in_this_process(
         "run", "built-in:tiny?frames=12", "--imu", imu, *NO_MESH, "--set", "bus.window=1",
         "--output", tmp_path / "result",
     )  # fmt: skip

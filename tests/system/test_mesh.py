@@ -87,7 +87,7 @@ def test_a_mesher_that_is_killed_fuses_again_and_the_mesh_is_that_of_an_ordinary
     assert meshes[0] == meshes[1]
     # A power cut after the end, before the state was cleared away.
     (output / "state").mkdir()
-    again = pliant("run", TINY, "--resume", "--output", output)
+    again = in_this_process("run", TINY, "--resume", "--output", output)
     assert again.returncode == 0, again.stderr
     assert "was already complete" in again.stderr
     assert digests(output) == digests(result)
