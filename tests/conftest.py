@@ -121,6 +121,17 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
+@pytest.fixture(scope="session", autouse=True)
+def no_waiting_for_the_disk() -> Iterator[None]:
+    """Thousands of files are synchronised here, each for milliseconds in which nothing else runs.
+
+    tests/services/test_power_cut.py checks what is synchronised, and when.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda descriptor: None)
+        yield
+
+
 @pytest.fixture(scope="session")
 def rigid_data() -> Path:
     """The real sequences, where they are at hand."""

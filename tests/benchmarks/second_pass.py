@@ -6,13 +6,9 @@ from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-
-from benchmarks.deceiving import wrong_poses
-from benchmarks.deceiving_scenes import CAMERA, Deceiver, Film, Way
 from benchmarks.in_process import shown_ate, true_poses
 from benchmarks.table import markdown_header, markdown_row
-from pliant.algorithms.arrays import F64, U8
+from pliant.algorithms.arrays import F64
 from pliant.algorithms.slam.atlas.known_places import KnownPlaces
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.backwards import lost_stretches, reach_back
@@ -30,7 +26,6 @@ _HEADER = (
     *("source", "pass", "frames with a pose", "segments", "in the largest", "ATE"),
     *("of the first's frames", "CPU"),
 )
-_DARK_S = 1.5
 
 
 @dataclass
@@ -126,37 +121,3 @@ def _ate(one: Pass, poses: dict[int, tuple[int, F64]], truth: Trajectory | None)
     if truth is None:
         return "-"
     return shown_ate(evaluate_trajectory(one.history.trajectory(poses), truth))
-
-
-def film_of(deceiver: Deceiver, way: str, seed: int) -> tuple[Frames, dict[int, F64], int]:
-    """A deceiver, mapped, and seen again from the dark by one of its ways: the source, the true
-    poses of its frames, and the first in the dark."""
-    greys, truth = list[U8](), dict[int, F64]()
-
-    def see(film: Film, way: Way) -> None:
-        for grey, pose in film.along(way, len(greys)):
-            truth[len(greys)] = pose
-            greys.append(grey)
-
-    see(Film(deceiver, seed), deceiver.there)
-    night = len(greys)
-    greys += [np.zeros_like(greys[0])] * round(_DARK_S * CAMERA.fps)
-    see(Film(deceiver.after_the_dark(), seed), deceiver.again[way])
-    camera = CAMERA.pinhole()
-    calibration = Calibration(
-        model="pinhole", width=camera.width, height=camera.height, fx=camera.fx, fy=camera.fy,
-        cx=camera.cx, cy=camera.cy,
-    )  # fmt: skip
-    frames = [
-        SourceFrame(
-            index=n, stamp_ns=round(1e9 * n / CAMERA.fps), encoding="mono8", data=grey.tobytes(),
-            width=camera.width, height=camera.height,
-        )
-        for n, grey in enumerate(greys)
-    ]  # fmt: skip
-    return Frames(calibration, frames), truth, night
-
-
-def wrong_in(one: Pass, truth: dict[int, F64], apart_m: float) -> list[int]:
-    """Frames whose pose is that of a place that looks alike."""
-    return sorted({frame for _, frame in wrong_poses(one.poses, truth, apart_m)})

@@ -7,19 +7,22 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from running import TINY, pliant
+from running import COARSE_MESH, TINY, in_this_process
 
 
 @pytest.fixture(scope="session")
 def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The result folder of ``pliant run built-in:tiny`` with the defaults: this worker's copy."""
+    """The result folder of ``pliant run built-in:tiny`` with a coarse mesh: this worker's copy.
+
+    tests/system/test_readme.py runs with the defaults.
+    """
     folder = tmp_path_factory.mktemp("run") / "tiny"
     ours = tmp_path_factory.getbasetemp()
     shared = (ours.parent if "PYTEST_XDIST_WORKER" in os.environ else ours) / "run_of_all_workers"
     with shared.with_suffix(".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not shared.exists():
-            done = pliant("run", TINY, "--output", folder)
+            done = in_this_process("run", TINY, *COARSE_MESH, "--output", folder)
             assert done.returncode == 0, done.stderr
             (folder / "logs" / "stdout").write_text(done.stdout)
             folder.rename(shared)

@@ -78,7 +78,7 @@ def pliant(
 def in_this_process(
     *arguments: object, cwd: Path | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """As `pliant`, of a command that starts no services: a process takes seconds to start."""
+    """As `pliant`, where the command's own process is not tested: it takes a second to start."""
     words, output, errors = list(map(str, arguments)), io.StringIO(), io.StringIO()
     with (
         chdir(cwd or Path.cwd()),

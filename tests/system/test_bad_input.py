@@ -132,7 +132,7 @@ def test_a_mistake_is_one_line(
 
 def test_a_source_that_fails_before_its_first_frame_leaves_no_result(here: Path) -> None:
     part = ("--start", "1.01", "--end", "1.02")
-    done = pliant("run", TINY, *part, *NO_MESH, "--output", "part", cwd=here)
+    done = in_this_process("run", TINY, *part, *NO_MESH, "--output", "part", cwd=here)
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith("pliant: ingest: built-in:tiny: no frame lies")
     assert done.stdout == ""
@@ -141,7 +141,7 @@ def test_a_source_that_fails_before_its_first_frame_leaves_no_result(here: Path)
     for name in ("trajectory.txt", "recording.mcap", "config.yaml", "notes"):
         (here / "result" / name).write_text("precious\n")
     before = {path: path.read_bytes() for path in here.rglob("*") if path.is_file()}
-    done = pliant("run", TINY, *part, "--output", "result", "--force", cwd=here)
+    done = in_this_process("run", TINY, *part, "--output", "result", "--force", cwd=here)
     assert_one_line(done, "built-in:tiny: no frame lies")
     after = {path: path.read_bytes() for path in here.rglob("*") if path.is_file()}
     assert after == before
@@ -155,7 +155,9 @@ def test_an_earlier_result_survives_a_mistake_with_force(here: Path) -> None:
         done = in_this_process("run", here / "nan", "--output", "result", "--force", cwd=here)
         assert_one_line(done, "calib.yaml")
         write_sequence(here / "good", IMAGES)
-        done = pliant("run", here / "good", "--output", "result", "--force", "--port", port)
+        done = in_this_process(
+            "run", here / "good", "--output", "result", "--force", "--port", port
+        )
     assert_one_line(done, "in use")
     assert (here / "result" / "trajectory.txt").read_text() == "precious\n"
 
@@ -185,7 +187,7 @@ def test_broken_frames_are_counted_named_and_passed_over(tmp_path: Path) -> None
     images[6].write_bytes(images[6].read_bytes()[:2000])
     other = cv2.imread(str(images[8]))
     cv2.imwrite(str(images[8]), other[:-20])
-    done = pliant("run", source, "--output", tmp_path / "result", *NO_MESH)
+    done = in_this_process("run", source, "--output", tmp_path / "result", *NO_MESH)
     assert done.returncode == 3, done.stderr
     report = json.loads((tmp_path / "result" / "report.json").read_text())
     assert report["frames"] == len(images)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from mp4_patches import turned
-from running import NO_MESH, TINY, pliant
+from running import NO_MESH, TINY, in_this_process
 
 import pliant as pliant_api
 from pliant.datasets.builtin import builtin_folder
@@ -31,7 +31,7 @@ def test_an_upright_clip_is_mapped_and_its_recording_replays_to_the_same_bytes(
     clip.write_bytes(turned(clip.read_bytes(), 90))
     folder = tmp_path / "result"
     given = ("--calibration", sequence / "calib.yaml")
-    done = pliant("run", clip, *given, *NO_MESH, "--output", folder)
+    done = in_this_process("run", clip, *given, *NO_MESH, "--output", folder)
     assert done.returncode == 0, done.stderr
     # Where nothing draws nobody is told to look on (and in test_mesh.py, without Rerun).
     assert (f"; watch live: pliant view {folder}" in done.stderr) == bool(find_spec("rerun"))
@@ -39,5 +39,5 @@ def test_an_upright_clip_is_mapped_and_its_recording_replays_to_the_same_bytes(
     assert result.image(20).shape[:2] == (height, width)
     assert len(result.trajectory) == len(upright)
     again = ("--services", "tracking,bundle_adjustment", "--check")
-    checked = pliant("replay", folder, *again)
+    checked = in_this_process("replay", folder, *again)
     assert checked.returncode == 0, checked.stdout + checked.stderr

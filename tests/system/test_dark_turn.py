@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from inertial_motion import PHONE, Motion, samples_of
-from running import NO_MESH, pliant
+from running import NO_MESH, in_this_process
 from sample_files import write_imu_csv
 
 from pliant.algorithms.geometry import align_umeyama, so3_exp
@@ -42,7 +42,7 @@ def test_dark_frames_are_placed_by_the_gyro(tmp_path: Path) -> None:
     )  # fmt: skip
     imu = write_imu_csv(tmp_path / "imu.csv", samples)
     result = tmp_path / "result"
-    done = pliant("run", folder, "--imu", imu, *NO_MESH, "--output", result)
+    done = in_this_process("run", folder, "--imu", imu, *NO_MESH, "--output", result)
     assert done.returncode == 0, done.stderr
     assert (
         f"{len(DARK)} frames without a pose by images, placed by the gyro between others"

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from benchmarks.in_process import process
-from running import NO_MESH, in_this_process, pliant, write_sequence
+from running import NO_MESH, in_this_process, write_sequence
 
 from pliant.config import load_config
 from pliant.datasets import open_source
@@ -119,7 +119,7 @@ def run(source: Path, history: MapHistory) -> str:
 def test_a_run_without_a_map_ends_with_code_3_and_the_reason(tmp_path: Path) -> None:
     """Of one frame, so that the stream ends where it begins."""
     source = write_sequence(tmp_path / "video", VIDEOS["one frame"]())
-    done = pliant("run", source, *NO_MESH, "--output", tmp_path / "result")
+    done = in_this_process("run", source, *NO_MESH, "--output", tmp_path / "result")
     assert done.returncode == 3, done.stderr
     assert "Traceback" not in done.stderr
     (line,) = [line for line in done.stdout.splitlines() if "no map could start" in line]

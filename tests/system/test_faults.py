@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from running import TINY, assert_one_line, digests, in_this_process, pliant
+from running import TINY, assert_one_line, digests, in_this_process
 from watched_runs import REQUEST, SERVICES, TooLateError, run, run_attacked
 
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
@@ -271,7 +271,7 @@ def test_a_live_run_is_not_resumed_but_its_recording_is_a_source(
     refused = in_this_process("run", TINY, "--resume", "--output", tmp_path)
     assert_one_line(refused, "was recorded live")
     said = refused.stderr[refused.stderr.index("`pliant run ") + 1 :].split()[1:3]
-    again = pliant(*said, "--output", tmp_path / "again", "--set", "meshing.enabled=false")
+    again = in_this_process(*said, "--output", tmp_path / "again", "--set", "meshing.enabled=false")
     assert again.returncode == 3, again.stderr  # as incomplete as the recording
     assert "frames at" in again.stdout
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from running import NO_MESH, TINY, assert_one_line, digests, in_this_process, pliant
+from running import NO_MESH, TINY, assert_one_line, digests, in_this_process
 
 import pliant as library
 from pliant.algorithms.geometry import inverse, so3_log
@@ -25,7 +25,7 @@ def office(tiny_run: Path) -> Path:
 
 def test_a_run_continues_in_a_map_and_replays(office: Path, tmp_path: Path) -> None:
     before = (office / "map.pliant").read_bytes()
-    done = pliant("run", TINY, "--map", office, *NO_MESH, "--output", tmp_path / "today")
+    done = in_this_process("run", TINY, "--map", office, *NO_MESH, "--output", tmp_path / "today")
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "today" / "report.json").read_text())
     assert report["known_map"]["frames_in_it"] == report["frames_with_pose"] == report["frames"]
@@ -39,7 +39,7 @@ def test_a_run_continues_in_a_map_and_replays(office: Path, tmp_path: Path) -> N
     told = in_this_process("map", "info", tmp_path / "today")
     assert "sessions: 2" in told.stdout
 
-    again = pliant("replay", tmp_path / "today", "--check", "--output", tmp_path / "again")
+    again = in_this_process("replay", tmp_path / "today", "--check", "--output", tmp_path / "again")
     assert again.returncode == 0, again.stdout
     assert "map/kept" in again.stdout
     kept = [tmp_path / name / "map.pliant" for name in ("today", "again")]
@@ -51,7 +51,7 @@ def test_a_run_continues_in_a_map_and_replays(office: Path, tmp_path: Path) -> N
 def test_a_run_only_localises(source: str, office: Path, tmp_path: Path) -> None:
     """Also with a larger camera than that of the map, and with few of the tracks that it has."""
     only = ("--map", office, "--localise", "--light", *NO_MESH)
-    done = pliant("run", source, *only, "--output", tmp_path / "robot")
+    done = in_this_process("run", source, *only, "--output", tmp_path / "robot")
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "robot" / "report.json").read_text())
     assert report["frames_with_pose"] == report["frames"]
@@ -108,7 +108,10 @@ def test_images_of_another_camera_are_found_in_the_map(office: Path) -> None:
 
 def test_two_maps_become_one_in_which_images_are_found(office: Path, tmp_path: Path) -> None:
     tuesday, one = tmp_path / "tuesday", tmp_path / "one.pliant"
-    assert pliant("run", TINY, "--start", "0.4", *NO_MESH, "--output", tuesday).returncode == 0
+    assert (
+        in_this_process("run", TINY, "--start", "0.4", *NO_MESH, "--output", tuesday).returncode
+        == 0
+    )
     done = in_this_process("map", "merge", office, tuesday, "--output", one)
     assert done.returncode == 0, done.stderr
     assert "is now part of segment 0" in done.stdout

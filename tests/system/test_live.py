@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from benchmarks.endurance import forth_and_back
-from running import TINY, pliant
+from running import TINY, in_this_process
 
 from pliant.bus.session import may_lock_memory
 from pliant.config import config_yaml, load_config
@@ -90,5 +90,5 @@ def test_tracking_continues_and_the_run_can_be_replayed(tmp_path: Path) -> None:
     assert age["p99"] > 1e3 * (GO_FRAME - STOP_FRAME) / FPS / 2
     assert any("age of an image when its pose is published" in line for line in summary(report))
     again = ("replay", output / RECORDING_NAME, "--services", "tracking,bundle_adjustment")
-    done = pliant(*again, "--output", tmp_path / "again", "--check")
+    done = in_this_process(*again, "--output", tmp_path / "again", "--check")
     assert done.returncode == 0, done.stderr

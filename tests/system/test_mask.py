@@ -12,7 +12,7 @@ from typing import cast
 import cv2
 import numpy as np
 import pytest
-from running import COARSE_MESH, TINY, assert_one_line, in_this_process, pliant
+from running import COARSE_MESH, TINY, assert_one_line, in_this_process
 
 import pliant as pliant_api
 from pliant.algorithms.image.masks import clearance_of, unpacked
@@ -53,7 +53,7 @@ def bonnet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def result(bonnet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "drive"
-    done = pliant(
+    done = in_this_process(
         "run", bonnet / "drive", "--mask", bonnet / "mask.png", *COARSE_MESH, "--output", folder
     )
     assert done.returncode == 0, done.stderr
@@ -125,7 +125,7 @@ def test_what_is_left_out_is_dark_to_the_eye(result: Path, bonnet: Path, tmp_pat
 
 
 def test_its_replay_gives_the_same_bytes(result: Path, tmp_path: Path) -> None:
-    done = pliant("replay", result, "--check", "--output", tmp_path / "again")
+    done = in_this_process("replay", result, "--check", "--output", tmp_path / "again")
     assert done.returncode == 0, done.stdout + done.stderr
 
 

@@ -70,7 +70,7 @@ def test_a_mesher_that_is_killed_fuses_again_and_the_mesh_is_that_of_an_ordinary
     result: Path, tmp_path: Path
 ) -> None:
     output = tmp_path / "restartable"
-    with running(TINY, "--on-crash", "restart", "--output", output) as run:
+    with running(TINY, *COARSE_MESH, "--on-crash", "restart", "--output", output) as run:
         run.wait_for("meshing the recording")
         while not (meshers := children(run.process.pid, "mesh.afterwards")):
             assert run.process.poll() is None
@@ -87,7 +87,7 @@ def test_a_mesher_that_is_killed_fuses_again_and_the_mesh_is_that_of_an_ordinary
     assert meshes[0] == meshes[1]
     # A power cut after the end, before the state was cleared away.
     (output / "state").mkdir()
-    again = pliant("run", TINY, "--resume", "--output", output)
+    again = in_this_process("run", TINY, "--resume", "--output", output)
     assert again.returncode == 0, again.stderr
     assert "was already complete" in again.stderr
     assert digests(output) == digests(result)
@@ -100,7 +100,7 @@ def test_the_mesh_is_made_again_closed(result: Path, tmp_path: Path) -> None:
     except Open3dError as error:
         pytest.skip(f"open3d is installed but cannot be loaded ({error})")
     output = tmp_path / "solid"
-    done = pliant("mesh", result, "--output", output, "--watertight")
+    done = in_this_process("mesh", result, "--output", output, "--watertight")
     assert done.returncode == 0, done.stderr
     assert "mesh_watertight.ply: " in done.stdout
     exported = export_result(result, "watertight", tmp_path / "exported.ply")
@@ -112,7 +112,7 @@ def test_the_mesh_is_made_again_without_small_pieces(result: Path, tmp_path: Pat
     for output, options in ((whole, ()), (clean, ("--clean",))):
         # Meshes of landmarks alone are not finished, and have small pieces.
         sets = ("--set", "meshing.depth=points")
-        done = pliant("mesh", result, "--output", output, *options, *sets)
+        done = in_this_process("mesh", result, "--output", output, *options, *sets)
         assert done.returncode == 0, done.stderr
     before, after = (read_ply(folder / "mesh.ply").faces for folder in (whole, clean))
     assert before is not None
@@ -123,12 +123,12 @@ def test_the_mesh_is_made_again_without_small_pieces(result: Path, tmp_path: Pat
 
 
 def test_the_mesh_is_made_again_with_other_parameters(result: Path, tmp_path: Path) -> None:
-    done = pliant("mesh", result, "--output", tmp_path / "same")
+    done = in_this_process("mesh", result, "--output", tmp_path / "same")
     assert done.returncode == 0, done.stderr
     for name in ("mesh.ply", "mesh_coarse.ply"):
         assert (tmp_path / "same" / name).read_bytes() == (result / name).read_bytes()
-    sets = ("--set", "meshing.tsdf.fine_voxel=0.03")
-    done = pliant("mesh", result, "--output", tmp_path / "rough", *sets)
+    sets = ("--set", "meshing.tsdf.fine_voxel=0.08")
+    done = in_this_process("mesh", result, "--output", tmp_path / "rough", *sets)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "rough" / "mesh.ply").stat().st_size < (
         0.3 * (result / "mesh.ply").stat().st_size
@@ -141,7 +141,7 @@ def test_a_mesh_made_again_is_evaluated_with_the_poses_of_its_run(
 ) -> None:
     (tmp_path / "made").mkdir()
     run = shutil.copytree(result, tmp_path / "made" / "run")
-    done = pliant("mesh", run, "--set", "meshing.depth=points", *COARSE_MESH)
+    done = in_this_process("mesh", run, "--set", "meshing.depth=points", *COARSE_MESH)
     assert done.returncode == 0, done.stderr
     moved = (tmp_path / "made").rename(tmp_path / "moved")
     meshed = moved / "run_mesh"
@@ -152,7 +152,7 @@ def test_a_mesh_made_again_is_evaluated_with_the_poses_of_its_run(
     found: list[object] = []
     for folder in (meshed, by_hand):
         figures = tmp_path / "figures.json"
-        done = pliant("eval", folder, "-g", TINY, "--mesh", "--json", figures, "--force")
+        done = in_this_process("eval", folder, "-g", TINY, "--mesh", "--json", figures, "--force")
         assert done.returncode == 0, done.stderr
         content = json.loads(figures.read_text())
         found.append((content["final"], content["mesh"], content["mesh_coarse"]))
@@ -177,7 +177,7 @@ def test_a_voxel_too_small_for_the_memory_is_refused_before_the_work(
 
 def test_the_service_replays_to_the_same_bytes(result: Path, tmp_path: Path) -> None:
     arguments = ("--services", "meshing", "--check", "--output", tmp_path / "again")
-    done = pliant("replay", result, *arguments)
+    done = in_this_process("replay", result, *arguments)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "the same bytes as recorded: mesh/blocks, mesh/final" in done.stdout
 
@@ -188,7 +188,7 @@ def test_a_run_needs_neither_open3d_nor_a_viewer(tmp_path: Path) -> None:
     (hidden / "__init__.py").write_text("raise SystemExit('open3d was imported')")
     (hidden.parent / "sitecustomize.py").write_text("import sys\nsys.modules['rerun'] = None\n")
     environment = {"PYTHONPATH": str(hidden.parent)}
-    arguments = ("--output", tmp_path / "result", "--set", "ingest.mode=lossless")
+    arguments = ("--output", tmp_path / "result", *COARSE_MESH)
     done = pliant("run", f"{TINY}?frames=12", *arguments, env=environment)
     assert done.returncode == 0, done.stderr
     assert "fine mesh: " in done.stdout

@@ -36,7 +36,8 @@ def commands() -> list[str]:
 
 @pytest.fixture(scope="module")
 def sequence() -> Path:
-    return builtin_folder("built-in:tiny")
+    """Half the width and the frames of built-in:tiny, whose run is that of the notebook."""
+    return builtin_folder("built-in:tiny?width=160&frames=24")
 
 
 @pytest.fixture(scope="module")

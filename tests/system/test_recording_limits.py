@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from benchmarks.recorder_kills import measure
-from running import AS_FROM_A_SHELL, NO_MESH, TINY, pliant
+from running import AS_FROM_A_SHELL, NO_MESH, TINY, in_this_process
 
 from pliant.config import config_yaml, load_config
 from pliant.messages import topics
@@ -91,11 +91,11 @@ def test_a_full_disk_is_one_line_and_what_was_written_is_readable(tmp_path: Path
 
 def test_a_recording_without_images_lists_what_cannot_be_replayed(tmp_path: Path) -> None:
     folder = tmp_path / "small"
-    pliant("run", f"{TINY}?frames=12", "--output", folder, "--no-images", *NO_MESH)
+    in_this_process("run", f"{TINY}?frames=12", "--output", folder, "--no-images", *NO_MESH)
     summary = summarise(folder)
     assert summary.complete
     assert topics.SOURCE.key not in summary.topics
-    done = pliant("replay", folder, "--services", "tracking")
+    done = in_this_process("replay", folder, "--services", "tracking")
     assert done.returncode == 1
     assert "tracking cannot be replayed: the recording is without camera/source" in done.stderr
 

@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from browser import in_browser
-from running import TINY, undescribed
-from running import pliant as pliant_command
+from running import TINY, in_this_process, undescribed
 
 import pliant
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
@@ -135,7 +134,7 @@ def test_the_truth_adds_the_error_over_time(result: pliant.Result, tmp_path: Pat
     before = page.read_text(encoding="utf-8")
     said: list[str] = []
     for _ in range(2):  # the second instead of the first
-        done = pliant_command("eval", folder, "--groundtruth", TINY)
+        done = in_this_process("eval", folder, "--groundtruth", TINY)
         assert done.returncode == 0, done.stderr
         assert f"error over time: {page}" in done.stdout
         said.append(page.read_text(encoding="utf-8"))

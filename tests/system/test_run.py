@@ -73,7 +73,9 @@ def test_an_existing_result_is_not_overwritten(result: Path) -> None:
 
 def test_evaluation_of_a_run(result: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(result, tmp_path / "result")
-    done = pliant("eval", folder, "--groundtruth", TINY, "--json", folder / "evaluation.json")
+    done = in_this_process(
+        "eval", folder, "--groundtruth", TINY, "--json", folder / "evaluation.json"
+    )
     assert done.returncode == 0, done.stderr
     figures = json.loads((folder / "evaluation.json").read_text())
     assert figures["final"]["success"]

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import yaml
 from running import NO_MESH, TINY, assert_one_line, in_this_process
-from running import pliant as command
 
 import pliant
 from pliant.algorithms.arrays import F64, U8
@@ -36,7 +35,7 @@ pytestmark = pytest.mark.system
 def doubled(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A result whose unit is two metres."""
     folder = Path(shutil.copytree(tiny_run, tmp_path_factory.mktemp("scale") / "tiny"))
-    done = command("scale", folder, "--points", "-0.5,0,1", "0.5,0,1", 2)
+    done = in_this_process("scale", folder, "--points", "-0.5,0,1", "0.5,0,1", 2)
     assert done.returncode == 0, done.stderr
     assert "a unit of the map is 2 m" in done.stdout
     return folder
@@ -79,17 +78,17 @@ def test_exports_and_python_are_in_metres(tiny_run: Path, doubled: Path, tmp_pat
 
 
 def test_a_mesh_that_is_made_again_is_in_metres(doubled: Path, tmp_path: Path) -> None:
-    done = command("mesh", doubled, "--output", tmp_path / "mesh")
+    done = in_this_process("mesh", doubled, "--output", tmp_path / "mesh")
     assert done.returncode == 0, done.stderr
     again, before = (read_ply(folder / "mesh.ply") for folder in (tmp_path / "mesh", doubled))
     np.testing.assert_allclose(again.points.min(axis=0), before.points.min(axis=0), rtol=0.02)
 
 
 def test_the_scale_is_saved_with_the_map_and_the_result(doubled: Path, tmp_path: Path) -> None:
-    assert "scale: metres" in command("map", "info", doubled).stdout
+    assert "scale: metres" in in_this_process("map", "info", doubled).stdout
     today = tmp_path / "today"
     arguments = ("--map", doubled, "--end", "0.7", *NO_MESH)
-    done = command("run", TINY, *arguments, "--output", today)
+    done = in_this_process("run", TINY, *arguments, "--output", today)
     assert done.returncode == 0, done.stderr
     assert json.loads((today / "report.json").read_text())["scale_is_metric"]
     there, then = read_tum(today / "trajectory.txt"), read_tum(doubled / "trajectory.txt")
@@ -101,7 +100,7 @@ def test_the_scale_is_saved_with_the_map_and_the_result(doubled: Path, tmp_path:
 
 def test_the_last_given_scale_counts(doubled: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(doubled, tmp_path / "tiny"))
-    done = command("scale", folder, "--depth", TINY)
+    done = in_this_process("scale", folder, "--depth", TINY)
     assert done.returncode == 0, done.stderr
     assert "a metre so far is" in done.stdout
     found = evaluate_result(folder, groundtruth=builtin_folder(TINY)).final.alignment
@@ -113,8 +112,8 @@ def test_a_marker_determines_the_scale(tmp_path: Path) -> None:
     source, result = tmp_path / "with-marker", tmp_path / "result"
     shutil.copytree(builtin_folder(TINY), source)
     put_marker_into(source, side_m=0.25)
-    assert command("run", source, *NO_MESH, "--output", result).returncode == 0
-    done = command("scale", result, "--marker", 0.25)
+    assert in_this_process("run", source, *NO_MESH, "--output", result).returncode == 0
+    done = in_this_process("scale", result, "--marker", 0.25)
     assert done.returncode == 0, done.stderr
     assert "1 marker of 0.25 m" in done.stdout
     found = evaluate_result(result, groundtruth=source / "groundtruth.txt").final.alignment

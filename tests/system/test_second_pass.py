@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from running import COARSE_MESH, NO_MESH, TINY, assert_one_line, digests, in_this_process, pliant
+from running import COARSE_MESH, NO_MESH, TINY, assert_one_line, digests, in_this_process
 
 from pliant.datasets.builtin import builtin_folder
 from pliant.datasets.source_spec import SourceSpec
@@ -34,7 +34,7 @@ def late(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
         image = cv2.imread(str(path))
         assert image is not None
         cv2.imwrite(str(path), generator.integers(0, 256, image.shape[:2], np.uint8))
-    done = pliant("run", source, *COARSE_MESH, "--output", output)
+    done = in_this_process("run", source, *COARSE_MESH, "--output", output)
     assert done.returncode == 0, done.stderr
     shutil.copytree(builtin_folder(TINY) / "images", source / "images", dirs_exist_ok=True)
     return source, output
@@ -75,7 +75,9 @@ def test_what_was_lost_at_the_beginning_is_found(
     assert contents(output).keys() == known.keys()  # nothing of the first stays, nothing beside it
 
     for services, same in ((), "tracks/extrema"), (("--services", "meshing"), "mesh/final"):
-        done = pliant("replay", output, "--check", *services, "--output", tmp_path / "r", "--force")
+        done = in_this_process(
+            "replay", output, "--check", *services, "--output", tmp_path / "r", "--force"
+        )
         assert done.returncode == 0, done.stdout + done.stderr
         assert same in done.stdout
         assert ("two passes" in done.stderr) == (not services)
@@ -106,7 +108,9 @@ def test_the_first_result_stays_if_the_second_pass_fails(
 
 
 def test_where_nothing_is_lost_the_first_result_is_the_best(tiny_run: Path, tmp_path: Path) -> None:
-    done = pliant("run", TINY, "--quality", "high", *NO_MESH, "--output", tmp_path / "tiny")
+    done = in_this_process(
+        "run", TINY, "--quality", "high", *NO_MESH, "--output", tmp_path / "tiny"
+    )
     assert done.returncode == 0, done.stderr
     assert "second pass: no frame with image content was lost" in done.stderr
     assert digests(tmp_path / "tiny") == digests(tiny_run)

@@ -70,11 +70,11 @@ def test_status_and_stop_of_a_session_in_parts(endpoint: str, tmp_path) -> None:
         }
         rows: dict[str, str] = {}
         while not set(services) <= set(rows):  # they come up by and by
-            shown = pliant("status", "--connect", endpoint, "--session", "lab")
+            shown = in_this_process("status", "--connect", endpoint, "--session", "lab")
             rows = {line.split()[1]: line for line in shown.stdout.splitlines()[1:]}
             assert all(service.poll() is None for service in services.values())
         assert rows["tracking"].startswith("lab ")
-        stopped = pliant("stop", "--connect", endpoint, "--session", "lab")
+        stopped = in_this_process("stop", "--connect", endpoint, "--session", "lab")
         assert stopped.returncode == 0, stopped.stderr
         assert {name: service.wait(60) for name, service in services.items()} == dict.fromkeys(
             services, 0
@@ -93,9 +93,9 @@ def test_a_command_fixes_its_arithmetic_itself() -> None:
 
 
 def test_an_empty_router_has_no_services_and_no_session(endpoint: str) -> None:
-    shown = pliant("status", "--connect", endpoint, "--seconds", "1.5")
+    shown = in_this_process("status", "--connect", endpoint, "--seconds", "1.5")
     assert (shown.returncode, "no services" in shown.stderr) == (1, True)
-    stopped = pliant("stop", "--connect", endpoint, "--session", "none")
+    stopped = in_this_process("stop", "--connect", endpoint, "--session", "none")
     assert (stopped.returncode, "no session none" in stopped.stderr) == (1, True)
 
 
@@ -109,14 +109,14 @@ def test_a_run_is_found_by_its_result_folder(tmp_path: Path) -> None:
     with start("run", long_source(tmp_path), *NO_MESH, "--output", str(result)) as run:
         rows: set[str] = set()
         while not ({"ingest", "recorder"} <= rows and has_frames(result)):
-            shown = pliant("status", str(result), "--seconds", "1.5")
+            shown = in_this_process("status", str(result), "--seconds", "1.5")
             rows = {line.split()[1] for line in shown.stdout.splitlines()[1:]}
             assert run.poll() is None
         endpoint = json.loads((result / "session.json").read_text())["endpoint"]
         socket = Path(endpoint.removeprefix("unixsock-stream/"))
         assert stat.S_ISSOCK(socket.stat().st_mode)
         assert socket.parent.stat().st_mode & 0o777 == 0o700
-        stopped = pliant("stop", str(result))
+        stopped = in_this_process("stop", str(result))
         assert stopped.returncode == 0, stopped.stderr
         assert run.wait(120) in (0, 3)
         assert not socket.parent.exists()

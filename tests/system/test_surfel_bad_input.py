@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from running import pliant
+from running import in_this_process
 
 from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.datasets.builtin import builtin_folder
@@ -77,7 +77,7 @@ def test_a_film_in_which_everything_goes_wrong(tmp_path: Path) -> None:
     film.add(film.image(8 + JUMP)[:, ::-1])
 
     output = tmp_path / "result"
-    done = pliant(
+    done = in_this_process(
         "run", tmp_path / "film", "--profile", "deformable", "--depth-frames", "all",
         "--output", output, "--set", "surfels.max_surfels=120",
     )  # fmt: skip

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from running import assert_one_line, in_this_process, pliant, undescribed
+from running import assert_one_line, in_this_process, undescribed
 
 from pliant.export.export import export_result
 from pliant.formats.ply import read_ply
@@ -27,7 +27,7 @@ FEW = ("--set", "surfels.max_surfels=60", "--set", "bus.checkpoint_frames=1")
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("surfels") / "tiny"
-    done = pliant("run", TINY, "--profile", "deformable", "--output", folder, *FEW)
+    done = in_this_process("run", TINY, "--profile", "deformable", "--output", folder, *FEW)
     assert done.returncode == 0, done.stderr
     assert f"{FRAMES} frames" in done.stdout
     assert done.stdout.splitlines()[-1] == "good: all frames have a pose in one segment"
@@ -99,12 +99,12 @@ def test_surfels_are_drawn_in_both_viewers(result: Path, tmp_path: Path) -> None
 
 
 def test_a_replay_and_a_run_on_the_recording_give_the_same(result: Path, tmp_path: Path) -> None:
-    again = pliant(
+    again = in_this_process(
         "replay", result, "--services", "surfels", "--check", "--output", tmp_path / "replay"
     )
     assert again.returncode == 0, again.stdout + again.stderr
     assert "the same bytes as recorded: surfels/state" in again.stdout
-    once_more = pliant(
+    once_more = in_this_process(
         "run", result, "--profile", "deformable", "--output", tmp_path / "run",
         "--on-crash", "restart", *FEW,
     )  # fmt: skip

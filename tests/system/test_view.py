@@ -81,8 +81,11 @@ def test_wrong_requests_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert not (tmp_path / "x.rrd").exists()
 
 
-def test_a_view_of_nothing_leaves_what_was_saved_before(tmp_path: Path) -> None:
+def test_a_view_of_nothing_leaves_what_was_saved_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("rerun")
+    monkeypatch.setattr("pliant.bus.session.CONNECT_TIMEOUT_S", 0.3)
     there = tmp_path / "there.rrd"
     there.write_text("mine")
     for source in (("--connect", free_endpoint(), "--session", "none"), (tmp_path / "nothing",)):
