@@ -30,6 +30,7 @@ from pliant.algorithms.surfels.surfel_alignment import (
     Matcher,
     Workspace,
     align_all,
+    evaluate_all,
     make_workspace,
     no_equilibrium,
 )
@@ -293,6 +294,8 @@ class SurfelTracker:
             if moving:
                 equilibrium = Equilibrium(transform(T_camera_world, table.rest), weights)
                 start = move_poses(table.guesses, T_camera_world)
+            if not moving and number == together - 1:
+                self._stay_where_it_fits(number, level, start, poses)
             # Alone each surfel finds its pixel; close to it its depth would drift.
             if number == coarsest or number >= together:
                 self._align_alone(number, level, poses, everyone, equilibrium, timer)
@@ -304,6 +307,19 @@ class SurfelTracker:
         if moving:
             self._T_world_camera = inverse(T_camera_world)
         return torn
+
+    def _stay_where_it_fits(self, number: int, level: Level, start: F64, poses: F64) -> None:
+        """Undo the coarse scales where they do not raise the ZNCC.
+
+        A patch of a coarse scale covers more of the scene: what deforms, or an instrument, moves
+        it.  Near by, the fine scales then end in another minimum.  start: poses before the coarse
+        scales.  poses: after them, overwritten.
+        """
+        everyone, matcher = np.ones(len(poses), np.uint8), self._matcher(number, level)
+        before = evaluate_all(start, everyone, matcher, zncc=True)
+        after = evaluate_all(poses, everyone, matcher, zncc=True)
+        stay = before.zncc >= after.zncc
+        poses[stay] = start[stay]
 
     def _start_at(self, goals: F64 | None, level: Level, poses: F64, active: U8) -> None:
         if goals is not None and self._table.templates:
