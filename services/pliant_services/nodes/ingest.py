@@ -105,15 +105,17 @@ def run(
                 source = link.source(source)
                 image = rectified(source, rectifier)
             if live:
+                image = replace(image, live=True)
                 image = pace.mark(image, images_that_wait(bus), config.ingest)
             dropped += source.dropped
             broken += image.missing.startswith(BROKEN)
             if clip is not None and not clip.is_as_it_was():
                 clip = None  # the file now differs from what was sent
-            bus.publish(topics.SOURCE, _source_message(source, image, clip is not None))
+            message = _source_message(source, image, clip is not None)
+            bus.publish(topics.SOURCE, message, live=live)
             may_lag = readers_that_may_lag(image)
-            bus.publish(topics.IMAGE, link.image(image, source), may_lag=may_lag)
-            bus.publish(topics.DEPTH, _depth_message(source), may_lag=may_lag)
+            bus.publish(topics.IMAGE, link.image(image, source), live=live, may_lag=may_lag)
+            bus.publish(topics.DEPTH, _depth_message(source), live=live, may_lag=may_lag)
             counters = {"dropped": dropped, "broken": broken, **pace.counters}
             counters |= static_counters(dataset)
             counters |= {CAPTURED: source.captured_s} if live else {}

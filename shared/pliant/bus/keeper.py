@@ -105,8 +105,9 @@ class Keeper:
         wake = self.shared.wake
         last_tick = time.monotonic()
         while not self._closing:
-            gap = any(entry.box.gap for entry in self.inputs.values())
-            pause_s = _ASK_AGAIN_S if gap else last_tick + TICK_S - time.monotonic()
+            soon = any(entry.box.gap for entry in self.inputs.values())
+            soon |= any(output.dropping for output in self.outputs.values())
+            pause_s = _ASK_AGAIN_S if soon else last_tick + TICK_S - time.monotonic()
             wake.wait(max(0.0, pause_s))
             wake.clear()
             tick = time.monotonic() - last_tick >= TICK_S
@@ -124,6 +125,7 @@ class Keeper:
                 self._keep_input(entry, tick=tick, greeting=greeting)
             for output in self.outputs.values():
                 output.send_again()
+                output.remind()
                 if tick:
                     output.sent_at_tick = output.box.sent
 
@@ -157,8 +159,11 @@ class Keeper:
         with self.shared.changed:
             request = NOTHING
             now = time.monotonic()
-            if entry.box.gap and now - entry.requested_at >= _ASK_AGAIN_S:
-                entry.box.gap, entry.requested_at, request = False, now, NOW
+            first = entry.box.next_sequence
+            has_come = first != entry.requested_from  # what was requested last
+            if entry.box.gap and (has_come or now - entry.requested_at >= _ASK_AGAIN_S):
+                entry.box.gap, request = False, NOW
+                entry.requested_at, entry.requested_from = now, first
             elif tick and entry.wanted and not entry.arrived:
                 request = IF_OLD
             if tick:
