@@ -94,7 +94,7 @@ def test_requested_messages_go_out_some_at_a_time_from_the_first_that_has_not_co
     """Newer ones wait for them: in live mode tracking would, too."""
     outbox = Outbox("t", ["slow"], window=20)
     for _ in range(9):
-        outbox.add(0, bytes(1 << 20))
+        outbox.add(0, bytes(2 << 20))
     requested: list[list[int]] = []
     for received in (2, 6, 9):  # of which it takes none
         outbox.credit("slow", 1, 0, 0, received=received)

@@ -159,11 +159,8 @@ class Keeper:
         with self.shared.changed:
             request = NOTHING
             now = time.monotonic()
-            first = entry.box.next_sequence
-            has_come = first != entry.requested_from  # what was requested last
-            if entry.box.gap and (has_come or now - entry.requested_at >= _ASK_AGAIN_S):
-                entry.box.gap, request = False, NOW
-                entry.requested_at, entry.requested_from = now, first
+            if entry.box.gap and now - entry.requested_at >= _ASK_AGAIN_S:
+                entry.box.gap, entry.requested_at, request = False, now, NOW
             elif tick and entry.wanted and not entry.arrived:
                 request = IF_OLD
             if tick:

@@ -59,7 +59,7 @@ class InLink:
     safe: messages that we will never request again.     wanted: the service waits for this topic.
     arrived: whether one came since the last tick.     ended: its end was kept before we started.
     reported: messages taken when we last reported our counts.
-    requested_at, requested_from: when we requested missing messages, and the first of them.
+    requested_at: when we requested missing messages.
     """
 
     def __init__(self, shared: Shared, topic: Topic, sender: str, *, reader: str, limit: Window):
@@ -67,7 +67,7 @@ class InLink:
         self.sender = sender
         self.box = Inbox(limit.messages, limit.size)
         self.safe = self.reported = 0
-        self.requested_at, self.requested_from = float("-inf"), -1
+        self.requested_at = float("-inf")
         self.wanted = self.arrived = self.ended = False
         self._shared = shared
         # In a queue of their own, and packed together: a sender that stands still never fills it.
@@ -201,9 +201,13 @@ class OutLink:
     def remind(self) -> None:
         """Send the number of the next message if none went out lately and a reader lacks some."""
         sent, self._sent_at_look = self._sent_at_look, self.box.sent
-        if self.dropping and sent == self.box.sent and self.box.on_the_way():
-            with self._sending:
+        if not self.dropping or sent != self.box.sent or not self.box.on_the_way():
+            return
+        if self._sending.acquire(blocking=False):  # otherwise one goes out now
+            try:
                 self._put_head(self._some)
+            finally:
+                self._sending.release()
 
     def _put_head(self, publisher: zenoh.Publisher) -> None:
         self._put(publisher, Numbered(self.box.sent, HEAD, b""))

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pliant.bus.base import Window
 from pliant.errors import BusError
 
-_AT_ONCE_BYTES = 4 << 20
+_AT_ONCE_BYTES = 8 << 20
 """Of messages that are sent again, before newer ones go out."""
 
 
