@@ -164,8 +164,18 @@ class OutLink:
         self._first_again, self._tries = -1, 0  # what was sent again last, and how often in turn
         self._sending = threading.Lock()
         self._shared = shared
-        self._all = _publisher(shared, topic.key, zenoh.CongestionControl.BLOCK)
-        self._some = _publisher(shared, topic.key, zenoh.CongestionControl.DROP)
+        self._all = shared.session.declare_publisher(
+            f"{shared.prefix}/{topic.key}",
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            express=True,
+        )
+        # In another queue: what is dropped waits for what the router waits for, too.
+        self._some = shared.session.declare_publisher(
+            f"{shared.prefix}/{topic.key}",
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.DATA_HIGH,
+            express=True,
+        )
         key = f"{shared.prefix}/credit/{topic.key}/*"
         self._held = shared.session.declare_subscriber(key, directly(self._on_credit))
 
@@ -261,9 +271,3 @@ def first_arrived(links: Sequence[InLink]) -> InLink:
 def directly(callback: Callable[[zenoh.Sample], None]) -> "zenoh.handlers.Callback[zenoh.Sample]":
     """In Zenoh's own thread, not in one more for each topic that every message must wake."""
     return zenoh.handlers.Callback(callback, indirect=False)
-
-
-def _publisher(shared: Shared, key: str, congested: zenoh.CongestionControl) -> zenoh.Publisher:
-    return shared.session.declare_publisher(
-        f"{shared.prefix}/{key}", congestion_control=congested, express=True
-    )

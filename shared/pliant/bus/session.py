@@ -111,7 +111,8 @@ def _config(mode: str, identity: Identity | None, *, pixels: bool = False) -> ze
         "transport/link/tx/queue/congestion_control/block/wait_before_close",
         str(_PATIENCE_MS * 1000),
     )
-    config.insert_json5("transport/link/tx/queue/size/data", str(_BATCHES))
+    for queue in ("data", "data_high"):
+        config.insert_json5(f"transport/link/tx/queue/size/{queue}", str(_BATCHES))
     drops_us = _ROUTER_DROPS_US if mode == "router" else _SENDER_DROPS_US
     config.insert_json5(
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop", str(drops_us)
