@@ -111,11 +111,10 @@ def run(
             broken += image.missing.startswith(BROKEN)
             if clip is not None and not clip.is_as_it_was():
                 clip = None  # the file now differs from what was sent
-            message = _source_message(source, image, clip is not None)
-            bus.publish(topics.SOURCE, message, live=live)
+            bus.publish(topics.SOURCE, _source_message(source, image, clip is not None))
             may_lag = readers_that_may_lag(image)
             bus.publish(topics.IMAGE, link.image(image, source), live=live, may_lag=may_lag)
-            bus.publish(topics.DEPTH, _depth_message(source), live=live, may_lag=may_lag)
+            bus.publish(topics.DEPTH, _depth_message(source), may_lag=may_lag)
             counters = {"dropped": dropped, "broken": broken, **pace.counters}
             counters |= static_counters(dataset)
             counters |= {CAPTURED: source.captured_s} if live else {}

@@ -76,7 +76,7 @@ class Bus(Protocol):
     ) -> None:
         """Send one message.  Blocks while a required reader is a whole window behind.
 
-        live: a reader that stands still does not delay the others before that.
+        live: from now on, a reader that stands still does not delay the others before that.
         may_lag: readers that may be further behind with it: it takes no room in their window.
         """
         ...

@@ -105,8 +105,8 @@ class Keeper:
         wake = self.shared.wake
         last_tick = time.monotonic()
         while not self._closing:
-            soon = any(entry.box.gap for entry in self.inputs.values())
-            soon |= any(output.dropping for output in self.outputs.values())
+            gap = any(entry.box.gap for entry in self.inputs.values())
+            soon = gap or self.shared.dropping
             pause_s = _ASK_AGAIN_S if soon else last_tick + TICK_S - time.monotonic()
             wake.wait(max(0.0, pause_s))
             wake.clear()

@@ -40,7 +40,8 @@ class Shared:
     """The common state of the links of one bus.
 
     changed: the lock, and who waits for something to change.     wake: rouses the keeper.
-    may_drop: whether the router may drop messages of live mode.
+    may_drop: whether the router may drop messages of live mode.     dropping: whether it may drop
+    ours, since the first of live mode.
     arrivals: messages that have come, over all topics.
     """
 
@@ -50,6 +51,7 @@ class Shared:
     wake: threading.Event
     peers: Peers
     may_drop: bool
+    dropping: bool = False
     arrivals: int = 0
 
 
@@ -134,11 +136,7 @@ class InLink:
 
 
 class OutLink:
-    """An output.
-
-    sent_at_tick: what had been sent a while ago, and so must have arrived.
-    dropping: whether it has messages that the router may drop.
-    """
+    """An output.  sent_at_tick: what had been sent a while ago, and so must have arrived."""
 
     def __init__(
         self,
@@ -159,7 +157,7 @@ class OutLink:
             windows={} if topic.kept_whole else windows,
             lags=lags,
         )
-        self.ended = self.dropping = False
+        self.ended = False
         self.sent_at_tick = self._sent_at_look = 0
         self._first_again, self._tries = -1, 0  # what was sent again last, and how often in turn
         self._sending = threading.Lock()
@@ -181,13 +179,13 @@ class OutLink:
 
     def send(self, kind: int, payload: bytes, may_lag: Collection[str], *, live: bool) -> None:
         """Number a message, keep it, and send it."""
-        if live and self._shared.may_drop and not self.dropping:
-            self.dropping = True
+        if live and self._shared.may_drop and not self._shared.dropping:
+            self._shared.dropping = True
             self._shared.wake.set()  # the keeper reminds readers from now on
         with self._sending:
             with self._shared.changed:
                 message = self.box.add(kind, payload, may_lag)  # before its credit is here
-            self._put(self._some if self.dropping else self._all, message)
+            self._put(self._some if self._shared.dropping else self._all, message)
 
     def send_again(self) -> None:
         """Send the messages that a reader has requested.  Raises BusError if they are no longer
@@ -202,7 +200,8 @@ class OutLink:
                 return
             first, before = messages[0].sequence, self._first_again
             self._first_again, self._tries = first, self._tries + 1 if first == before else 1
-            publisher = self._some if self.dropping and self._tries <= TRIES else self._all
+            may_drop = self._shared.dropping and self._tries <= TRIES
+            publisher = self._some if may_drop else self._all
             for message in messages:
                 self._put(publisher, message)
             if messages[-1].sequence + 1 < self.box.sent:
@@ -211,7 +210,7 @@ class OutLink:
     def remind(self) -> None:
         """Send the number of the next message if none went out lately and a reader lacks some."""
         sent, self._sent_at_look = self._sent_at_look, self.box.sent
-        if not self.dropping or sent != self.box.sent or not self.box.on_the_way():
+        if not self._shared.dropping or sent != self.box.sent or not self.box.on_the_way():
             return
         if self._sending.acquire(blocking=False):  # otherwise one goes out now
             try:

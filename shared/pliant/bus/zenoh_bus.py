@@ -212,7 +212,8 @@ class ZenohBus:
     ) -> None:
         """Send one message, once every required reader is within the window.
 
-        live: a reader that does not read its socket does not delay the others on this machine.
+        live: from now on, a reader that does not read its socket does not delay the others on this
+        machine.
         may_lag: readers in whose window it takes no room, where ``lags`` names them; with it no
         more than that is on the way to them.
         Raises MessageError if the message is larger than its topic's readers take.
