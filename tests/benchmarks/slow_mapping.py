@@ -146,7 +146,10 @@ def measure(
 
 
 class _slow:  # noqa: N801 (a context manager)
-    """Lets a process run for one part in ``slowdown`` of the time, and as it is afterwards."""
+    """Lets a process run for one part in ``slowdown`` of the time, and as it is afterwards.
+
+    With an infinite one it stands still.
+    """
 
     def __init__(self, pid: int, slowdown: float) -> None:
         self._pid = pid
@@ -166,5 +169,7 @@ class _slow:  # noqa: N801 (a context manager)
             while not self._over.is_set():
                 os.kill(self._pid, signal.SIGSTOP)
                 self._over.wait(_PERIOD_S - self._runs_s)
-                os.kill(self._pid, signal.SIGCONT)
+                if self._runs_s > 0.0:
+                    os.kill(self._pid, signal.SIGCONT)
                 self._over.wait(self._runs_s)
+            os.kill(self._pid, signal.SIGCONT)

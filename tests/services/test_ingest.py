@@ -3,9 +3,10 @@
 import signal
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -89,8 +90,8 @@ class SlowBus(ReplayBus):
         super().__init__({})
         self._on_image = on_image
 
-    def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
-        super().publish(topic, message, may_lag=may_lag)
+    def publish(self, topic: Topic, message: Header, **how: Any) -> None:
+        super().publish(topic, message, **how)
         if topic is topics.IMAGE:
             self._on_image(message.frame)
             self.waited_s = {"tracking": 0.5 * (message.frame + 1)}
@@ -137,9 +138,9 @@ def test_the_camera_comes_first_and_its_topic_is_closed_before_the_first_frame()
     order: list[str] = []
 
     class Bus(ReplayBus):
-        def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
+        def publish(self, topic: Topic, message: Header, **how: Any) -> None:
             order.append(topic.key)
-            super().publish(topic, message, may_lag=may_lag)
+            super().publish(topic, message, **how)
 
         def end(self, topic: Topic, *, complete: bool = True) -> None:
             order.append(f"end of {topic.key}")
@@ -261,10 +262,10 @@ def test_a_file_is_looked_into_while_its_readers_start() -> None:
     read: list[int] = []
 
     class Readers(ReplayBus):
-        def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
+        def publish(self, topic: Topic, message: Header, **how: Any) -> None:
             if topic is topics.STREAM:
                 assert read == [0]
-            super().publish(topic, message, may_lag=may_lag)
+            super().publish(topic, message, **how)
 
     run(FakeDataset([png(i) for i in range(3)], before=read.append), Readers({}))
     assert read == [0, 1, 2, 3]

@@ -2,10 +2,11 @@
 
 import threading
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -210,8 +211,8 @@ class OneReader(ReplayBus):
         self._most: int | None = None  # that may wait before the ingest goes on
         self.reported = -1
 
-    def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
-        super().publish(topic, message, may_lag=may_lag)
+    def publish(self, topic: Topic, message: Header, **how: Any) -> None:
+        super().publish(topic, message, **how)
         if isinstance(message, Image):
             with self._changed:
                 self._wait_for(self._window - 1)

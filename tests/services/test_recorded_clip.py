@@ -3,8 +3,8 @@
 import os
 import random
 import threading
-from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -181,8 +181,8 @@ class WritingBus(ReplayBus):
         super().__init__({})
         self._clip, self._frame = clip, frame
 
-    def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
-        super().publish(topic, message, may_lag=may_lag)
+    def publish(self, topic: Topic, message: Header, **how: Any) -> None:
+        super().publish(topic, message, **how)
         if topic == topics.IMAGE and message.frame == self._frame:
             with self._clip.open("ab") as file:
                 file.write(b"more")

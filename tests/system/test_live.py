@@ -9,7 +9,6 @@ import pytest
 from benchmarks.endurance import forth_and_back
 from running import TINY, in_this_process
 
-from pliant.bus.session import may_lock_memory
 from pliant.config import config_yaml, load_config
 from pliant.datasets.builtin import builtin_folder
 from pliant.datasets.source_spec import SourceSpec
@@ -33,10 +32,6 @@ STOP_FRAME, GO_FRAME = 10, 34
 """Bundle adjustment stands still from the one until tracking has told of the other."""
 
 
-@pytest.mark.skipif(
-    not may_lock_memory(),
-    reason="images for a stopped process fill its socket: needs shared memory (ulimit -l)",
-)
 def test_tracking_continues_and_the_run_can_be_replayed(tmp_path: Path) -> None:
     warm_up.compile_kernels(print)
     output = tmp_path / "run"

@@ -90,6 +90,19 @@ def test_requested_messages_that_arrived_meanwhile_are_not_sent_again() -> None:
     assert outbox.take_requested() == ()
 
 
+def test_requested_messages_go_out_some_at_a_time_from_the_first_that_has_not_come() -> None:
+    """Newer ones wait for them: in live mode tracking would, too."""
+    outbox = Outbox("t", ["slow"], window=20)
+    for _ in range(9):
+        outbox.add(0, bytes(2 << 20))
+    requested: list[list[int]] = []
+    for received in (2, 6, 9):  # of which it takes none
+        outbox.credit("slow", 1, 0, 0, received=received)
+        outbox.asking.add("slow")
+        requested.append([message.sequence for message in outbox.take_requested()])
+    assert requested == [[2, 3, 4, 5], [6, 7, 8], []]
+
+
 def test_a_long_wait_is_reported_with_its_length() -> None:
     waiting = Waiting()
     assert waiting.description(now=100.0) == ""

@@ -5,12 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zenoh
 from zenoh_buses import PATIENCE_S, WINDOW, camera_stream, die, image, in_thread, reader, writer
 
 from pliant.algorithms.inertial.preintegration import GyroSignal
 from pliant.bus import health
 from pliant.bus.base import Window
 from pliant.bus.checkpoints import Checkpoints
+from pliant.bus.links import HEAD, TRIES
+from pliant.bus.outbox import Numbered
 from pliant.bus.zenoh_bus import ZenohBus
 from pliant.errors import BusError
 from pliant.messages import codec, topics
@@ -96,6 +99,31 @@ def test_who_may_lag_reports_each_message_live_and_half_a_window_else(
         assert found == list(enumerate(reports))
         sender.end_all()
         assert list(taken) == []
+
+
+def test_live_messages_that_the_router_drops_come_again_although_no_newer_one_follows(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with writer(endpoint) as sender, reader(endpoint) as bus:
+        output = sender._outputs[topics.IMAGE.key]
+        put, dropped = output._put, list[int]()
+
+        def drop(publisher: zenoh.Publisher, message: Numbered) -> None:
+            is_new = message.sequence not in dropped or message.sequence == WINDOW
+            if publisher is output._some and message.kind != HEAD and is_new:
+                dropped.append(message.sequence)
+            else:
+                put(publisher, message)
+
+        monkeypatch.setattr(output, "_put", drop)
+        taken = bus.receive(topics.IMAGE)
+        for frame in range(2 * WINDOW):
+            sender.publish(topics.IMAGE, image(frame), live=True)
+            assert next(taken).frame == frame
+        sender.end_all()
+        assert list(taken) == []
+    assert sorted({*dropped}) == list(range(2 * WINDOW + 1))  # its end, too
+    assert dropped.count(WINDOW) == 1 + TRIES  # then the router may not drop it
 
 
 def test_waits_are_recorded_with_peer_and_length(endpoint: str) -> None:

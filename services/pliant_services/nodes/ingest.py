@@ -105,6 +105,7 @@ def run(
                 source = link.source(source)
                 image = rectified(source, rectifier)
             if live:
+                image = replace(image, live=True)
                 image = pace.mark(image, images_that_wait(bus), config.ingest)
             dropped += source.dropped
             broken += image.missing.startswith(BROKEN)
@@ -112,7 +113,7 @@ def run(
                 clip = None  # the file now differs from what was sent
             bus.publish(topics.SOURCE, _source_message(source, image, clip is not None))
             may_lag = readers_that_may_lag(image)
-            bus.publish(topics.IMAGE, link.image(image, source), may_lag=may_lag)
+            bus.publish(topics.IMAGE, link.image(image, source), live=live, may_lag=may_lag)
             bus.publish(topics.DEPTH, _depth_message(source), may_lag=may_lag)
             counters = {"dropped": dropped, "broken": broken, **pace.counters}
             counters |= static_counters(dataset)

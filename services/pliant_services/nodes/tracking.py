@@ -33,7 +33,8 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
         else:
             tracks = tracker.track(image.grey, image.stamp_ns, monitor.stage, clearance(image))
         extrema = Extrema.of(image, tracks, missing=image.missing)
-        bus.publish(topics.EXTREMA, extrema, may_lag=readers_that_may_lag(image))
+        may_lag = readers_that_may_lag(image)
+        bus.publish(topics.EXTREMA, extrema, live=image.live, may_lag=may_lag)
         monitor.report(image, tracks=len(tracks.ids), maxima=len(tracks.maxima))
         bus.checkpoint(image.frame, tracker)
 

@@ -66,9 +66,17 @@ class Bus(Protocol):
         """How long each reader was waited for so far, by its name: a matter of timing, too."""
         ...
 
-    def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
+    def publish(
+        self,
+        topic: Topic,
+        message: Header,
+        *,
+        live: bool = False,
+        may_lag: Collection[str] = (),
+    ) -> None:
         """Send one message.  Blocks while a required reader is a whole window behind.
 
+        live: from now on, a reader that stands still does not delay the others before that.
         may_lag: readers that may be further behind with it: it takes no room in their window.
         """
         ...

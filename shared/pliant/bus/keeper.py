@@ -106,7 +106,8 @@ class Keeper:
         last_tick = time.monotonic()
         while not self._closing:
             gap = any(entry.box.gap for entry in self.inputs.values())
-            pause_s = _ASK_AGAIN_S if gap else last_tick + TICK_S - time.monotonic()
+            soon = gap or self.shared.dropping
+            pause_s = _ASK_AGAIN_S if soon else last_tick + TICK_S - time.monotonic()
             wake.wait(max(0.0, pause_s))
             wake.clear()
             tick = time.monotonic() - last_tick >= TICK_S
@@ -124,6 +125,7 @@ class Keeper:
                 self._keep_input(entry, tick=tick, greeting=greeting)
             for output in self.outputs.values():
                 output.send_again()
+                output.remind()
                 if tick:
                     output.sent_at_tick = output.box.sent
 

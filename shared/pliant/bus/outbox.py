@@ -16,16 +16,21 @@ from dataclasses import dataclass, field
 from pliant.bus.base import Window
 from pliant.errors import BusError
 
+_AT_ONCE_BYTES = 8 << 20
+"""Of messages that are sent again, before newer ones go out."""
+
 
 @dataclass
 class Reader:
     """The reports of a required reader.  incarnation: which start of it; -1 before its first
     report.
 
+    received: messages that it has, of which it has taken some.
     light: numbers of the messages that take no room in its window, among those that it may request.
     """
 
     incarnation: int = -1
+    received: int = 0
     taken: int = 0
     safe: int = 0
     light: deque[int] = field(default_factory=deque[int])
@@ -90,7 +95,14 @@ class Outbox:
         self.sent = sequence
 
     def credit(
-        self, name: str, incarnation: int, taken: int, safe: int, left: Collection[int] = ()
+        self,
+        name: str,
+        incarnation: int,
+        taken: int,
+        safe: int,
+        left: Collection[int] = (),
+        *,
+        received: int = 0,
     ) -> bool:
         """A reader's counts, which never fall but in another incarnation of it.
 
@@ -112,6 +124,7 @@ class Outbox:
         else:
             reader.taken = max(reader.taken, taken)
             reader.safe = max(reader.safe, min(safe, reader.taken))
+        reader.received = max(reader.taken, received)
         while reader.light and reader.light[0] < reader.safe:
             reader.light.popleft()
         floor = self.safe()
@@ -179,14 +192,17 @@ class Outbox:
         return len(self._kept)
 
     def take_requested(self) -> tuple[Numbered, ...]:
-        """The messages that readers have requested and still lack, once.
+        """The messages that readers have requested and still lack, once; the first of them where
+        they are many, so that newer ones are not delayed.
 
         By their latest report: delayed reports arrive together, and after the last of them the
         first may request a message that is no longer kept.  Raises BusError.
         """
-        taken = [self.readers[name].taken for name in self.asking]
+        received = [self.readers[name].received for name in self.asking]
         self.asking.clear()
-        return self.again(min(taken)) if taken else ()
+        missing = self.again(min(received, default=self.sent))
+        enough = _AT_ONCE_BYTES + min((message.before for message in missing), default=0)
+        return tuple(message for message in missing if message.before < enough)
 
     def again(self, sequence: int) -> tuple[Numbered, ...]:
         """Everything from a number on.  Raises BusError if it is not kept any more."""

@@ -14,7 +14,7 @@ from pliant.messages import codec
 from pliant.messages.topics import TOPICS, status
 from pliant.version import __version__
 
-WIRE_VERSION = 5
+WIRE_VERSION = 6
 """Version of envelopes and credits; services of different versions refuse each other."""
 SCHEMA = codec.schema_hash([topic.message for topic in (*TOPICS, status("*"))])
 """Hash of the messages' fields: with other fields a message would be misread."""

@@ -85,7 +85,14 @@ class ReplayBus:
     def wait_until_taken(self, topic: Topic) -> None:
         """Nothing: there is time for everything."""
 
-    def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
+    def publish(
+        self,
+        topic: Topic,
+        message: Header,
+        *,
+        live: bool = False,
+        may_lag: Collection[str] = (),
+    ) -> None:
         """Keep the message.  Raises ValueError after the topic's end, as no reader would see it."""
         if topic in self.ended:
             raise ValueError(f"{topic.key} was published after its end")

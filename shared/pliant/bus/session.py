@@ -24,6 +24,11 @@ from pliant.messages.topics import TOPICS
 
 CONNECT_TIMEOUT_S = 7.0  # with the start of Python, a user waits ten seconds at most
 _PATIENCE_MS = 60_000  # Zenoh's defaults lose messages after a stall of 5 to 10 s (its second line)
+_BATCHES = 16
+"""Of 64 KiB, in each queue for a reader: the most of Zenoh, so that an image has room."""
+_ROUTER_DROPS_US, _SENDER_DROPS_US = 20_000, 1_000_000
+"""How long a full queue delays a message of live mode before it is dropped: in the router, and in a
+sender, which must wait for the router; and 50 ms longer after its first batch."""
 TOKEN_LEASE_S = 5.0 + 1e-3 * _PATIENCE_MS
 """Seconds after which the router drops a service whose machine has vanished."""
 _LONGEST_SOCKET = 100  # bytes; Linux takes 107 and macOS 103
@@ -105,6 +110,12 @@ def _config(mode: str, identity: Identity | None, *, pixels: bool = False) -> ze
     config.insert_json5(
         "transport/link/tx/queue/congestion_control/block/wait_before_close",
         str(_PATIENCE_MS * 1000),
+    )
+    for queue in ("data", "data_high"):
+        config.insert_json5(f"transport/link/tx/queue/size/{queue}", str(_BATCHES))
+    drops_us = _ROUTER_DROPS_US if mode == "router" else _SENDER_DROPS_US
+    config.insert_json5(
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop", str(drops_us)
     )
     if identity is not None:
         side = "listen" if mode == "router" else "connect"

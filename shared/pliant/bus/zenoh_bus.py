@@ -32,7 +32,13 @@ from pliant.bus.checkpoints import Checkpoints, Place
 from pliant.bus.keeper import Keeper
 from pliant.bus.links import DATA, END, InLink, OutLink, Shared
 from pliant.bus.peers import OVER_KEY, STOP_KEY, Peers, token_key
-from pliant.bus.session import TOKEN_LEASE_S, Identity, open_session, session_name
+from pliant.bus.session import (
+    TOKEN_LEASE_S,
+    Identity,
+    is_beyond_loopback,
+    open_session,
+    session_name,
+)
 from pliant.bus.waits import Waits
 from pliant.errors import BusError, MessageError
 from pliant.messages import codec
@@ -110,7 +116,10 @@ class ZenohBus:
             self._wait_until_first(on_fault or (lambda line: None))
         self.stop_requested = False
         """Whether the end of the session was requested (``pliant stop``)."""
-        shared = Shared(self._session, self._prefix, self._changed, self._wake, self._peers)
+        may_drop = not any(is_beyond_loopback(endpoint) for endpoint in endpoints)
+        shared = Shared(
+            self._session, self._prefix, self._changed, self._wake, self._peers, may_drop
+        )
         self._outputs = {
             topic.key: OutLink(
                 shared,
@@ -194,9 +203,18 @@ class ZenohBus:
         output = self._outputs[topic.key]
         self._waits.for_readers(output, output.box.behind)
 
-    def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
+    def publish(
+        self,
+        topic: Topic,
+        message: Header,
+        *,
+        live: bool = False,
+        may_lag: Collection[str] = (),
+    ) -> None:
         """Send one message, once every required reader is within the window.
 
+        live: from now on, a reader that does not read its socket does not delay the others on this
+        machine.
         may_lag: readers in whose window it takes no room, where ``lags`` names them; with it no
         more than that is on the way to them.
         Raises MessageError if the message is larger than its topic's readers take.
@@ -207,7 +225,7 @@ class ZenohBus:
                 f"{topic.key}: frame {message.frame} takes {len(payload)} bytes, more than the "
                 f"{topic.max_bytes} allowed"
             )
-        self._send(self._outputs[topic.key], DATA, payload, may_lag)
+        self._send(self._outputs[topic.key], DATA, payload, may_lag, live=live)
 
     def publish_encoded(self, topic: Topic, payload: bytes) -> None:
         """Send a message that is encoded already, as a recording has it."""
@@ -251,13 +269,19 @@ class ZenohBus:
         self._waits.for_departures({entry.sender for entry in self._inputs.values()})
 
     def _send(
-        self, output: OutLink, kind: int, payload: bytes, may_lag: Collection[str] = ()
+        self,
+        output: OutLink,
+        kind: int,
+        payload: bytes,
+        may_lag: Collection[str] = (),
+        *,
+        live: bool = False,
     ) -> None:
         if output.ended:
             raise ValueError(f"{output.topic.key} was published after its end")
         self._disturb()
         self._waits.for_readers(output, lambda: output.box.full(len(payload), may_lag))
-        output.send(kind, payload, may_lag)
+        output.send(kind, payload, may_lag, live=live)
 
     # -- receiving -----------------------------------------------------------------------------
 

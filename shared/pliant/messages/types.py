@@ -181,6 +181,7 @@ class Image(Header):
     unmapped: bundle adjustment only localises this frame, by its tracks, as it is behind (live
     mode).   unplaced: it is so far behind that it does not do that either.
     mask: which pixels are used, as of ``pliant.algorithms.image.masks``; b"": all of them.
+    live: it was chosen in live mode, where a reader that stands still does not delay the others.
     """
 
     grey: Annotated[U8, Shape("H", "W")]
@@ -191,6 +192,7 @@ class Image(Header):
     unmapped: bool = False
     mask: bytes = b""
     unplaced: bool = False
+    live: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -193,7 +193,9 @@ def slow_mapping(
     source: Annotated[str, typer.Argument(help="built-in:NAME.")] = "built-in:room",
     frames: Annotated[int, typer.Option(min=40, help="Of the source, forth and back.")] = 1200,
     fps: Annotated[float, typer.Option(min=1.0, help="Frames a second.")] = 30.0,
-    slowdown: Annotated[float, typer.Option(min=1.0, help="Of bundle adjustment.")] = 10.0,
+    slowdown: Annotated[
+        float, typer.Option(min=1.0, help="Of bundle adjustment; inf: it stands still.")
+    ] = 10.0,
     overrides: Overrides = None,
 ) -> None:
     """Live mode before, while and after bundle adjustment is slow: what tracking keeps of its rate.
