@@ -109,15 +109,14 @@ def align_inertial(
             f"poses and inertial samples without gaps have {tied * _NODE_S:.1f} s in common: "
             f"at least {_LEAST * _NODE_S:.0f} s are needed"
         )
-    upwards = _mean_force(nodes, signal, rotation)
     allowed = _BIASES_M_S2 + _SPEED_CHANGE_M_S / (tied * _NODE_S)
-    shown = float(np.linalg.norm(upwards))
+    shown = float(np.linalg.norm(_mean_force(nodes, signal, rotation)))
     if abs(shown - GRAVITY_M_S2) > allowed:
         return Refusal(
             f"the accelerometer shows {shown:.1f} m/s^2 on average instead of {GRAVITY_M_S2}: "
             "its unit is another, or its axes are not those of the gyro"
         )
-    found = _best(nodes, signal, rotation, upwards)
+    found = _best(nodes, signal, rotation)
     return _judged(found, nodes, rotation, extent)
 
 
@@ -219,9 +218,7 @@ def _mean_force(nodes: Nodes, signal: ImuSignal, rotation: RotationAlignment) ->
     return max(means, key=lambda mean: float(np.linalg.norm(mean)))
 
 
-def _best(
-    nodes: Nodes, signal: ImuSignal, rotation: RotationAlignment, upwards: F64
-) -> Estimate | None:
+def _best(nodes: Nodes, signal: ImuSignal, rotation: RotationAlignment) -> Estimate | None:
     """The estimate that leaves the least noise to the positions."""
     densities, best = noise_densities(signal), None
     for R_camera_imu in rotation.starts:

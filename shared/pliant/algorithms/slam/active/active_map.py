@@ -103,7 +103,7 @@ class ActiveMap:
         self.points.place(rows, start.points_world)
         self.links.ids, self.links.rows = start.ids, rows
         self.links.follow(newest.ids, self.points)
-        self._link_new_tracks(newest.points_px)
+        self._link_new_tracks()
         self._paint(rows, start.newest_px, latest)
         self._paint(self.links.rows, newest.points_px, latest)
         self.points.kappas[self.links.rows] = newest.kappas
@@ -258,7 +258,7 @@ class ActiveMap:
         """Make the current frame a keyframe and adjust the window."""
         frame, found = placed.frame, placed.found
         points_px = frame.tracks.points_px
-        new = self._link_new_tracks(points_px)
+        new = self._link_new_tracks()
         self._paint(self.links.rows[new], points_px[new], frame)
         keyframe = self._append_keyframe(
             frame.number,
@@ -294,7 +294,7 @@ class ActiveMap:
         segment = self.segment
         segment.inverse_distance = self.window.place_candidates(segment.inverse_distance)
 
-    def _link_new_tracks(self, points_px: F32) -> I64:
+    def _link_new_tracks(self) -> I64:
         """Give candidate rows to tracks without one.  Returns the indices of those tracks."""
         new = np.flatnonzero(self.links.rows == UNLINKED)
         self.links.rows[new] = self._allocate(len(new))

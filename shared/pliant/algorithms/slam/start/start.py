@@ -230,7 +230,7 @@ def _start_from(
     tried = relative_poses(a, b, gate=gate)
     if not tried:
         return "no essential matrix fits the tracks"
-    reason = _why_not_with(tried[0], start, wanted)
+    reason = _why_not_with(tried[0], wanted)
     if reason:
         return reason  # the parallax of a worse motion is an error
     shared = waiting[-1].ids[pair.indices_newest]
@@ -241,7 +241,7 @@ def _start_from(
     least = wanted._replace(least_deg=start.min_parallax_deg)
     found: list[tuple[float, Start, RelativePose]] = []
     for two_views in compared:
-        each = _why_not_with(two_views, start, least) or _reconstruct(
+        each = _why_not_with(two_views, least) or _reconstruct(
             pair, two_views, waiting, camera, parameters, most
         )
         if isinstance(each, str):
@@ -254,7 +254,7 @@ def _start_from(
     for misfit, other, _ in found:
         if misfit < _AS_GOOD * least_misfit and not _agree(best, other):
             return "two motions explain the tracks equally well"
-    reason = _why_not_with(two_views, start, wanted)
+    reason = _why_not_with(two_views, wanted)
     if reason or most == len(shared):
         return reason or best
     return _reconstruct(pair, two_views, waiting, camera, parameters, len(shared))
@@ -283,7 +283,7 @@ def _waited_s(waiting: list[BufferedFrame]) -> float:
     return 1e-9 * (waiting[-1].stamp_ns - waiting[0].stamp_ns)
 
 
-def _why_not_with(two_views: RelativePose, start: StartParameters, wanted: _Parallax) -> str:
+def _why_not_with(two_views: RelativePose, wanted: _Parallax) -> str:
     share = float(two_views.inliers.mean())
     if share < _MIN_INLIER_SHARE:
         return f"too few tracks agree with one motion: {share:.0%} of {_MIN_INLIER_SHARE:.0%}"
