@@ -22,8 +22,11 @@ pixels, because errors of tracks are alike; g is more than 1 for a sensor with o
 noise.  Both are estimated as variance components (Foerstner 1979): with the redundancies, which
 add up to the number of residuals less that of the unknowns, ::
 
-    s^2 <- s^2 (d^T V d / s^2) / rho_V      rho_V = 6 N - 7 - trace(V / s^2  S^-1)
-    g^2 <- g^2 (sum |r_k|^2 / g^2) / rho_r
+    s^2 <- s^2 (d^T V d / s^2) / (rho_V + 3 sqrt(2 rho_V))
+    g^2 <- g^2 (sum |r_k|^2 / g^2) / rho_r      rho_V = 6 N - 7 - trace(V / s^2  S^-1)
+
+The sum of rho_V squares has a standard deviation of sqrt(2 rho_V).  So s is the least that the
+residuals do not contradict: a few keyframes cannot show that images are worse than their pixels.
 
 A sensor that contradicts neighbouring keyframes so gets a large g, and hardly moves them.
 """
@@ -55,6 +58,7 @@ _FIXED = 1e9
 """Information of what is held, relative to the mean of the poses' own."""
 _COLUMNS = 1024
 """Eliminated at a time: bounds memory."""
+_SIGMAS = 3.0
 _POSE = np.arange(6)
 
 
@@ -249,7 +253,9 @@ class System:
         residuals = after.size + 6 * count + priors
         of_samples = residuals - (OWN * count + COMMON) - of_images
         squares = float(moved @ self._visual @ moved) / self._s2, float((after**2).sum()) / self._g2
-        return squares[0] / max(of_images, 1.0), squares[1] / max(of_samples, 1.0)
+        of_images, of_samples = max(of_images, 1.0), max(of_samples, 1.0)
+        expected = of_images + _SIGMAS * np.sqrt(2.0 * of_images)
+        return float(squares[0] / expected), squares[1] / of_samples
 
 
 @dataclass(frozen=True, kw_only=True)
