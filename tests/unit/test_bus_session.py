@@ -8,7 +8,6 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-import zenoh
 
 from pliant.bus import session
 from pliant.bus.session import LocalRouter, free_endpoint, open_router, open_session
@@ -104,27 +103,3 @@ def test_a_port_in_use_is_one_line(endpoint: str) -> None:
     with pytest.raises(BusError, match="in use") as caught:
         open_router(endpoint)
     assert "\n" not in str(caught.value)
-
-
-def test_without_room_for_shared_memory_a_session_does_without(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    open_it, tried = zenoh.open, list[str]()
-
-    def refuse_it(config: zenoh.Config) -> zenoh.Session:
-        tried.append(config.get_json("transport/shared_memory/enabled"))
-        if tried[-1] == "true":
-            raise zenoh.ZError("Unable to create POSIX shm segment: OS error 12 at segment.rs:85.")
-        return open_it(config)
-
-    monkeypatch.setattr(zenoh, "open", refuse_it)
-    monkeypatch.setattr(session, "_LOCKED_BYTES", 0)
-    endpoint = free_endpoint()
-    router = open_router(endpoint)
-    open_session([endpoint]).close()  # type: ignore[no-untyped-call]
-    router.close()  # type: ignore[no-untyped-call]
-    assert tried == ["true", "false"] * 2
-    monkeypatch.setattr(session, "_LOCKED_BYTES", 1 << 62)
-    monkeypatch.setattr(session, "_CAP_IPC_LOCK", 0)  # an ordinary user, or a container
-    open_router(free_endpoint()).close()  # type: ignore[no-untyped-call]
-    assert tried == ["true", "false"] * 2 + ["false"]

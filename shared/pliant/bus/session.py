@@ -5,7 +5,6 @@ import json
 import os
 import re
 import reprlib
-import resource
 import shutil
 import socket
 import stat
@@ -32,19 +31,8 @@ sender, which must wait for the router; and 50 ms longer after its first batch."
 TOKEN_LEASE_S = 5.0 + 1e-3 * _PATIENCE_MS
 """Seconds after which the router drops a service whose machine has vanished."""
 _LONGEST_SOCKET = 100  # bytes; Linux takes 107 and macOS 103
-_SHARED_BYTES = 4 << 20
-"""Without images; each process has that of all that it reads.  Zenoh's default has room for some
-images."""
-_LOCKED_BYTES = 1 << 30
-"""Zenoh locks in memory what senders share, and keeps it when they restart.  Beyond the limit of
-the process it drops their messages without a word (zenoh, issues 2787 and 2788).
-"""
-_CAP_IPC_LOCK = 1 << 14
-"""Capability (7) to lock any amount; not that of root in a container."""
 _SOCKET = "unixsock-stream"
 _FOLDER, _BUS = "pliant-", "bus"
-_NO_SHARED_MEMORY = "shm segment"
-"""Zenoh's message for a full or missing /dev/shm."""
 _NO_SOCKET = "no Unix socket available: every user of this machine can reach the services"
 _MAX_BYTES = max(topic.max_bytes for topic in TOPICS) + (1 << 20)
 """A peer that announces more than our largest topic is cut off, before memory is allocated."""
@@ -91,14 +79,11 @@ class Identity:
         return own
 
 
-def _config(mode: str, identity: Identity | None, *, pixels: bool = False) -> zenoh.Config:
+def _config(mode: str, identity: Identity | None) -> zenoh.Config:
     config = zenoh.Config()
-    if not may_lock_memory():
-        config.insert_json5("transport/shared_memory/enabled", "false")
-    elif not pixels:
-        config.insert_json5(
-            "transport/shared_memory/transport_optimization/pool_size", str(_SHARED_BYTES)
-        )
+    # Beyond what a process may lock, 8 MiB for most users, Zenoh drops messages in shared memory
+    # without a word (its issues 2787 and 2788); below that a run takes no less CPU.
+    config.insert_json5("transport/shared_memory/enabled", "false")
     config.insert_json5("mode", json.dumps(mode))
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("scouting/gossip/enabled", "false")
@@ -130,20 +115,17 @@ def _config(mode: str, identity: Identity | None, *, pixels: bool = False) -> ze
     return config
 
 
-def open_session(
-    endpoints: Sequence[str], identity: Identity | None = None, *, pixels: bool = False
-) -> zenoh.Session:
+def open_session(endpoints: Sequence[str], identity: Identity | None = None) -> zenoh.Session:
     """Connect as a client.  ``identity``: for endpoints such as tls/host:7447.
 
-    pixels: images are sent, so that more memory is shared with readers on this machine.
     Raises BusError when no endpoint answers in time.
     """
-    config = _config("client", identity, pixels=pixels)
+    config = _config("client", identity)
     _set_endpoints(config, "connect", endpoints)
     config.insert_json5("connect/timeout_ms", str(int(CONNECT_TIMEOUT_S * 1000)))
     config.insert_json5("connect/exit_on_failure", "true")
     try:
-        return _opened(config)
+        return zenoh.open(config)
     except zenoh.ZError as error:
         raise BusError(
             f"cannot reach {', '.join(endpoints)} within {CONNECT_TIMEOUT_S:.0f} s: is the router "
@@ -167,36 +149,12 @@ def open_router(
     config.insert_json5("listen/exit_on_failure", "true")
     config.insert_json5("listen/timeout_ms", "0")
     try:
-        return _opened(config)
+        return zenoh.open(config)
     except zenoh.ZError as error:
         raise BusError(
             f"cannot listen on {', '.join(endpoints)}: is the port in use? Choose another with "
             f"--port ({_first_line(error)})"
         ) from None
-
-
-def may_lock_memory() -> bool:
-    """Whether this process may lock all the shared memory of a session: mostly root alone."""
-    limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    if limit == resource.RLIM_INFINITY or limit >= _LOCKED_BYTES:
-        return True
-    try:
-        status = Path("/proc/self/status").read_text(encoding="utf-8")
-    except OSError:  # not Linux
-        return False
-    found = re.search(r"^CapEff:\s*([0-9a-f]+)$", status, re.MULTILINE)
-    return found is not None and bool(int(found[1], 16) & _CAP_IPC_LOCK)
-
-
-def _opened(config: zenoh.Config) -> zenoh.Session:
-    """A session; without shared memory where there is no room for any.  Raises ZError."""
-    try:
-        return zenoh.open(config)
-    except zenoh.ZError as error:
-        if _NO_SHARED_MEMORY not in str(error):
-            raise
-    config.insert_json5("transport/shared_memory/enabled", "false")
-    return zenoh.open(config)
 
 
 def _set_endpoints(config: zenoh.Config, what: str, endpoints: Sequence[str]) -> None:

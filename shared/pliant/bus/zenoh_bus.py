@@ -42,7 +42,7 @@ from pliant.bus.session import (
 from pliant.bus.waits import Waits
 from pliant.errors import BusError, MessageError
 from pliant.messages import codec
-from pliant.messages.topics import WITH_PIXELS, Topic
+from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, Header, StreamEnd
 from pliant.state import load_state, save_state
 
@@ -110,8 +110,7 @@ class ZenohBus:
         needed = {name for readers in outputs.values() for name in readers} | set(inputs.values())
         self._peers = Peers(service, time.time_ns(), needed, stays=stays)
         self._waits = Waits(self._changed, self._peers, patience_s, interrupted or (lambda: False))
-        pixels = any(topic in WITH_PIXELS for topic in outputs)
-        self._session = open_session(endpoints, identity, pixels=pixels)
+        self._session = open_session(endpoints, identity)
         if stays:
             self._wait_until_first(on_fault or (lambda line: None))
         self.stop_requested = False
