@@ -284,6 +284,7 @@ class SurfelTracker:
         T_camera_world, equilibrium = inverse(self._T_world_camera), no_equilibrium(n)
         start, weights = poses, OMEGA_E / table.sigmas**2
         together = _TOGETHER_LEVELS[moving] if len(table.edges.ends) else 0
+        made_up = self._parameters.depth_from == "flat"
         for number in range(coarsest, -1, -1):
             level = pyramid[number]
             if number == coarsest:
@@ -294,7 +295,7 @@ class SurfelTracker:
             if moving:
                 equilibrium = Equilibrium(transform(T_camera_world, table.rest), weights)
                 start = move_poses(table.guesses, T_camera_world)
-            if not moving and number == together - 1:
+            if not moving and made_up and number == together - 1:
                 self._stay_where_it_fits(number, level, start, poses)
             # Alone each surfel finds its pixel; close to it its depth would drift.
             if number == coarsest or number >= together:
@@ -312,8 +313,8 @@ class SurfelTracker:
         """Undo the coarse scales where they do not raise the ZNCC.
 
         A patch of a coarse scale covers more of the scene: what deforms, or an instrument, moves
-        it.  Near by, the fine scales then end in another minimum.  start: poses before the coarse
-        scales.  poses: after them, overwritten.
+        it.  Near by, the fine scales then end in another minimum.  With a measured depth it gains
+        nothing.  start: poses before the coarse scales.  poses: after them, overwritten.
         """
         everyone, matcher = np.ones(len(poses), np.uint8), self._matcher(number, level)
         before = evaluate_all(start, everyone, matcher, zncc=True)
