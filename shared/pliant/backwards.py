@@ -6,6 +6,7 @@ two segments, are mapped from later ones, and segments that see the same place a
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -16,6 +17,7 @@ from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.image.masks import clearance_in, filled
 from pliant.algorithms.inertial.samples import ImuSamples
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
+from pliant.algorithms.slam.adjust.inertial_adjustment import CouplingOutcome
 from pliant.algorithms.slam.adjust.segment import PlacedFrames
 from pliant.algorithms.slam.calibration.self_calibration import widened
 from pliant.algorithms.slam.frame import Frame
@@ -101,7 +103,7 @@ class Reached:
     """The result of reading backwards, besides the history.
 
     kept: the whole map.   keyframes: new ones, by id.   joined: merged segments.
-    last: the last update, with the calibration.   counters: of the mapper.
+    last: the last update, with the calibration.   counters: of a mapper, what samples did.
     """
 
     kept: list[KeptKeyframe] = field(default_factory=list[KeptKeyframe])
@@ -151,9 +153,13 @@ def reach_back(
     collected.take_keyframes(mapper.publish_keyframes())
     if samples is not None and len(samples.stamps_ns):
         # Samples need the frames of both passes, relative to keyframes that are nearly final.
-        collected.take(mapper.finish(samples=samples, placed=collected.placed()))
-        collected.take_keyframes(mapper.publish_keyframes())
-    found.counters = mapper.counters
+        with_samples = deepcopy(mapper)
+        delta = with_samples.finish(samples=samples, placed=collected.placed())
+        found.counters = with_samples.counters
+        if found.counters.get("coupling_outcome") == CouplingOutcome.MOVED:
+            mapper = with_samples
+            collected.take(delta)
+            collected.take_keyframes(mapper.publish_keyframes())
     session = max(each.session for each in known)
     for each in map(_reversed, mapper.kept()):
         if each.session > session:  # it is of the same session as the first pass

@@ -159,8 +159,11 @@ def test_what_samples_did_to_the_keyframes_is_reported() -> None:
     report = rigid_report(run, {})
     assert report["coupling"] == {"keyframes": 52, "moved_mm": 2.1, "refusal": ""}
     assert "inertial samples moved 52 keyframes by 2.1 mm in the median" in summary(report)
-    report["inertial_refusal"] = "the gyro explains 12 %"
-    assert not [line for line in summary(report) if "samples moved" in line]
+    report["coupling"]["moved_mm"] = 149.6
+    assert "inertial samples moved 52 keyframes by 150 mm in the median" in summary(report)
+    report["coupling"]["refusal"] = "the focal length changes"
+    report["inertial_refusal"] = "the gyro explains 12 %"  # one refusal is enough
+    assert not [line for line in summary(report) if "the keyframes" in line]
 
 
 def test_one_is_not_many(tmp_path: Path) -> None:

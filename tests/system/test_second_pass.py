@@ -14,6 +14,8 @@ from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import PliantError
 from pliant.formats.tum import read_tum
 from pliant.recording.map_file import MapFile
+from pliant.recording.summary import SECOND_PASS, summarise
+from pliant.results.folder import RECORDING_NAME
 from pliant_services.run import second_pass as module
 from pliant_services.run.request import RunRequest
 from pliant_services.run.second_pass import is_better, second_pass
@@ -81,6 +83,8 @@ def test_what_was_lost_at_the_beginning_is_found(
         assert done.returncode == 0, done.stdout + done.stderr
         assert same in done.stdout
         assert ("two passes" in done.stderr) == (not services)
+        metadata = summarise(tmp_path / "r" / RECORDING_NAME).metadata
+        assert (SECOND_PASS in metadata) == bool(services)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), PliantError("no more"), MemoryError()])

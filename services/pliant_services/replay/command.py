@@ -87,8 +87,12 @@ def _replay_into(output: Path, request: ReplayRequest) -> int:
     }
     for line in gaps(recorded, services):
         print(line, file=sys.stderr)
-    if SECOND_PASS in recorded.metadata and topics.MAP_FINAL in replay.made:
-        print(f"{request.recording} has two passes: the replay makes the first", file=sys.stderr)
+    if SECOND_PASS in recorded.metadata:
+        if topics.MAP_FINAL in replay.made:
+            line = f"{request.recording} has two passes: the replay makes the first"
+            print(line, file=sys.stderr)
+        else:
+            metadata[SECOND_PASS] = recorded.metadata[SECOND_PASS]
     replay.run(output / RECORDING_NAME, metadata)
     report = write_results(output)
     if earlier.is_aside(output):

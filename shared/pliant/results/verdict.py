@@ -108,12 +108,15 @@ def _scale_lines(report: dict[str, Any]) -> list[str]:
 def _coupling_lines(report: dict[str, Any]) -> list[str]:
     """A line about what inertial samples did to keyframes, unless their refusal is known."""
     coupling = report.get("coupling")
-    if coupling is None or report.get("inertial_refusal"):
+    if coupling is None:
         return []
-    if coupling["refusal"]:
-        return [f"inertial samples did not move the keyframes: {coupling['refusal']}"]
-    moved = f"{counted(coupling['keyframes'], 'keyframe')} by {coupling['moved_mm']:.2g} mm"
-    return [f"inertial samples moved {moved} in the median"]
+    if why := coupling["refusal"]:
+        known = report.get("inertial_refusal")
+        return [] if known else [f"inertial samples did not move the keyframes: {why}"]
+    mm = coupling["moved_mm"]
+    moved = f"{mm:.2g}" if mm < 10.0 else f"{mm:.0f}"
+    keyframes = counted(coupling["keyframes"], "keyframe")
+    return [f"inertial samples moved {keyframes} by {moved} mm in the median"]
 
 
 def _gyro_lines(report: dict[str, Any]) -> list[str]:

@@ -79,7 +79,7 @@ def couple(
 ) -> Coupled | None:  # fmt: skip
     """Iterate from a start to convergence; None without it.
 
-    information: V.   held: (N,) keyframes that do not move, among them the first.
+    information: V.   held: (N,) keyframes that do not move.
     least_px: s is at least this.
     """
     visual = _with_gauge(information, nodes, held)

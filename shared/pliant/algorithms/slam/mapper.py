@@ -397,7 +397,7 @@ class Mapper:
         atlas, coupled = self.atlas, dict[str, float]()
         if self._couplings:  # of the largest segment
             most = max(self._couplings, key=lambda each: each.keyframes)
-            coupled = {f"coupling_{name}": value for name, value in vars(most).items()}
+            coupled = {f"coupling_{name}": float(value) for name, value in vars(most).items()}
         return {
             **atlas.places.comparisons.counters, **atlas.dropped, **self._turns.counters, **coupled
         }  # fmt: skip
