@@ -11,6 +11,7 @@ read slowly.
 
 import struct
 import threading
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -60,7 +61,7 @@ class InLink:
 
     safe: messages that we will never request again.     wanted: the service waits for this topic.
     arrived: whether one came since the last tick.     ended: its end was kept before we started.
-    reported: messages taken when we last reported our counts.
+    reported: messages taken when we last reported our counts.     unreported_bytes: taken since.
     requested_at: when we requested missing messages.
     """
 
@@ -68,7 +69,7 @@ class InLink:
         self.topic = topic
         self.sender = sender
         self.box = Inbox(limit.messages, limit.size)
-        self.safe = self.reported = 0
+        self.safe = self.reported = self.unreported_bytes = 0
         self.requested_at = float("-inf")
         self.wanted = self.arrived = self.ended = False
         self._shared = shared
@@ -85,7 +86,7 @@ class InLink:
         """Report our counts to the sender."""
         with self._shared.changed:
             received, taken = self.box.next_sequence, self.box.taken
-        self.reported = taken
+        self.reported, self.unreported_bytes = taken, 0
         self._credit.put(_CREDIT.pack(incarnation, received, taken, self.safe, request))
 
     def start_from(self, taken: int) -> None:
@@ -159,7 +160,7 @@ class OutLink:
         )
         self.ended = False
         self.sent_at_tick = self._sent_at_look = 0
-        self._first_again, self._tries = -1, 0  # what was sent again last, and how often in turn
+        self._tries = Counter[int]()  # how often messages were the first that went out again
         self._sending = threading.Lock()
         self._shared = shared
         self._all = shared.session.declare_publisher(
@@ -195,12 +196,13 @@ class OutLink:
             return
         with self._sending:
             with self._shared.changed:
-                messages = self.box.take_requested()
+                messages, safe = self.box.take_requested(), self.box.safe()
             if not messages:
                 return
-            first, before = messages[0].sequence, self._first_again
-            self._first_again, self._tries = first, self._tries + 1 if first == before else 1
-            may_drop = self._shared.dropping and self._tries <= TRIES
+            first = messages[0].sequence
+            self._tries = Counter({n: k for n, k in self._tries.items() if n >= safe})
+            self._tries[first] += 1
+            may_drop = self._shared.dropping and self._tries[first] <= TRIES
             publisher = self._some if may_drop else self._all
             for message in messages:
                 self._put(publisher, message)

@@ -249,6 +249,11 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
+def is_socket(endpoint: str) -> bool:
+    """Whether only processes of one user on this machine meet there, as those of a run do."""
+    return endpoint.startswith(f"{_SOCKET}/")
+
+
 def is_beyond_loopback(endpoint: str) -> bool:
     """Whether the text of a listening endpoint allows connections from other machines."""
     protocol, _, address = endpoint.partition("/")

@@ -35,7 +35,7 @@ from pliant.bus.peers import OVER_KEY, STOP_KEY, Peers, token_key
 from pliant.bus.session import (
     TOKEN_LEASE_S,
     Identity,
-    is_beyond_loopback,
+    is_socket,
     open_session,
     session_name,
 )
@@ -99,7 +99,7 @@ class ZenohBus:
         self._prefix = f"pliant/{session_name(session)}"
         lags = lags or {}
         own_lag = lags.get(service, Window(0, 0))
-        self._report_every = max(1, window // 2)
+        self._report_every = Window(max(1, window // 2), window_bytes // 2)
         self._may_lag = service in lags
         self._live = True  # until the stream says otherwise
         self._checkpoints = checkpoints
@@ -115,7 +115,8 @@ class ZenohBus:
             self._wait_until_first(on_fault or (lambda line: None))
         self.stop_requested = False
         """Whether the end of the session was requested (``pliant stop``)."""
-        may_drop = not any(is_beyond_loopback(endpoint) for endpoint in endpoints)
+        # Elsewhere a reader may have a slow link, on which an image takes too long.
+        may_drop = all(is_socket(endpoint) for endpoint in endpoints)
         shared = Shared(
             self._session, self._prefix, self._changed, self._wake, self._peers, may_drop
         )
@@ -212,8 +213,8 @@ class ZenohBus:
     ) -> None:
         """Send one message, once every required reader is within the window.
 
-        live: from now on, a reader that does not read its socket does not delay the others on this
-        machine.
+        live: from now on, a reader that does not empty its socket does not delay the others, where
+        all meet at one.
         may_lag: readers in whose window it takes no room, where ``lags`` names them; with it no
         more than that is on the way to them.
         Raises MessageError if the message is larger than its topic's readers take.
@@ -417,10 +418,13 @@ class ZenohBus:
     def _report_taken(self, entry: InLink, received: Received) -> None:
         # Each credit wakes the router and the sender: half a window at a time is enough.  Live, the
         # choice of images depends on what has been taken.
-        box = entry.box
+        box, every = entry.box, self._report_every
+        entry.unreported_bytes += len(received.data)
         all_taken = entry.topic.newest_wins and not box.waiting
-        at_once = received.is_end or (self._live and (self._may_lag or all_taken))
-        if at_once or box.taken - entry.reported >= self._report_every:
+        report = received.is_end or (self._live and (self._may_lag or all_taken))
+        report |= box.taken - entry.reported >= every.messages
+        report |= entry.unreported_bytes >= every.size
+        if report:
             self._keeper.report(entry)
 
     def _on_stop(self, _: zenoh.Sample) -> None:
