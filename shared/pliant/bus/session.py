@@ -24,10 +24,11 @@ from pliant.messages.topics import TOPICS
 CONNECT_TIMEOUT_S = 7.0  # with the start of Python, a user waits ten seconds at most
 _PATIENCE_MS = 60_000  # Zenoh's defaults lose messages after a stall of 5 to 10 s (its second line)
 _BATCHES = 16
-"""Of 64 KiB, in each queue for a reader: the most of Zenoh, so that an image has room."""
+"""Length of each transmission queue, in batches of 64 KiB: Zenoh's maximum, to hold an image."""
 _ROUTER_DROPS_US, _SENDER_DROPS_US = 20_000, 1_000_000
-"""How long a full queue delays a message of live mode before it is dropped: in the router, and in a
-sender, which must wait for the router; and 50 ms longer after its first batch."""
+"""How long a full queue may delay a droppable message: in the router, and in a sender, which must
+wait for the router.  Zenoh waits 50 ms longer for the batches after the first.
+"""
 TOKEN_LEASE_S = 5.0 + 1e-3 * _PATIENCE_MS
 """Seconds after which the router drops a service whose machine has vanished."""
 _LONGEST_SOCKET = 100  # bytes; Linux takes 107 and macOS 103

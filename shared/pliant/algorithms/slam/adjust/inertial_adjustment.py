@@ -98,6 +98,7 @@ def with_samples(
 
 
 def _fault(T: F64, timed: TimedSamples) -> CouplingOutcome | None:
+    """Why these keyframes cannot be tied by samples; None if they can."""
     if len(T) > _MOST_KEYFRAMES:
         return CouplingOutcome.TOO_MANY
     if len(np.unique(timed.keyframes_ns)) < 2 or timed.keyframes_ns.min() < 0:
