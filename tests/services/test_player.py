@@ -147,13 +147,26 @@ def test_ctrl_c_at_the_very_start_leaves_the_terminal_as_it_was(
         assert termios.tcgetattr(inside) == before
 
 
-def test_a_rate_is_a_share_of_the_pace_of_capture() -> None:
-    import time
+def test_a_rate_is_a_share_of_the_pace_of_capture(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Clock(threading.Condition):
+        now_s = 0.0
 
+        def monotonic(self) -> float:
+            return self.now_s
+
+        def wait(self, timeout: float | None = None) -> bool:
+            assert timeout is not None
+            self.now_s += timeout
+            return False
+
+    clock = Clock()
+    monkeypatch.setattr(play_command, "time", clock)
     pace = Pace(4.0)
-    start = time.monotonic()
+    pace._changed = clock
     assert pace.wait_until(200_000_000)
-    assert time.monotonic() - start >= 0.05
+    assert clock.now_s == 0.05
+    assert pace.wait_until(100_000_000)  # late: no wait
+    assert clock.now_s == 0.05
     unbounded = Pace(0.0)
     assert unbounded.wait_until(10**18)
 
