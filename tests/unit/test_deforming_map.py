@@ -8,13 +8,14 @@ import pytest
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.deformable.held_out import Evidence
+from pliant.algorithms.deformable.judged_map import doubt
 from pliant.algorithms.geometry import inverse, matrix_to_pose, so3_exp, transform
 from pliant.evaluation.deforming_map_truth import format_deforming_map, judge_deforming_map
 from pliant.evaluation.surface_truth import MaterialPoints, SurfaceTruth
 from pliant.formats.tum import write_tum
 from pliant.map_history import FramePose, Keyframe, MapHistory
 from pliant.rendering.deforming_scenes import BreathingOptions, deforming_scene
-from pliant.results.deforming_map import adjust_and_write, doubt
+from pliant.results.deforming_map import adjust_and_write
 from pliant.trajectory import Trajectory
 
 CAMERA = PinholeCamera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)

@@ -5,18 +5,23 @@ in   camera/stream    once
      camera/depth     every frame: empty, or a depth map: the first one starts the surfels
      tracks/extrema   every frame, where tracking runs: where surfels may have gone
      map/update, map/keyframe   every frame, where bundle adjustment runs: depths for births
+     map/deforming    every frame, where deformable mapping runs: better ones, and the camera
 out  surfels/state    one per frame: all surfels, and the camera; empty without pixels
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, U8
+from pliant.algorithms.arrays import F32, F64
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.deformable.priors import STIFF
+from pliant.algorithms.deformable.window import SPAN_NS
+from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.image.masks import glaring
+from pliant.algorithms.map_delta import TRACKING
 from pliant.algorithms.surfels.depth_maps import agree
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.prediction import predict
@@ -29,12 +34,13 @@ from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import calibration_from_yaml
 from pliant.datasets.depth import DepthRectifier
 from pliant.errors import ConfigError
-from pliant.map_depth import MapDepth, MapView
+from pliant.map_depth import MapDepth, MapView, view_of_window
 from pliant.messages import topics
 from pliant.messages.types import (
     WAITING_FOR_DEPTH,
     WORLD_FRAME_ID,
     CameraStream,
+    DeformingLandmarks,
     Depth,
     Extrema,
     Image,
@@ -46,17 +52,21 @@ from pliant_services.runtime.link_images import clearance, receive_images
 from pliant_services.runtime.monitor import Monitor
 
 _FLAT_DEPTH = 1.0
+_LANDMARKS = 4
+"""Of a window, around a surfel."""
 
 
 @dataclass(frozen=True)
 class _Heard:
-    """The inputs of one frame.  tracks, update, keyframe: where a service publishes them."""
+    """The inputs of one frame.  tracks, update, keyframe, deforming: where a service publishes
+    them."""
 
     image: Image
     depth: Depth
     tracks: Extrema | None = None
     update: MapUpdate | None = None
     keyframe: Keyframe | None = None
+    deforming: DeformingLandmarks | None = None
 
     @property
     def frame(self) -> int:
@@ -67,7 +77,9 @@ class _Heard:
 class _State:
     """map_depth: if surfels are created on our own map.    stamp_ns, tracks, points_px: of the
     last frame with pixels.    ratio, segment: units of the surfels by one of the map, and the
-    segment of the map, when surfels were last born on it."""
+    segment of the map, when surfels were last born on it.    deforms: whether the last window of a
+    map that deforms can be trusted.    cameras: stamp and pose of the frames since then that a
+    window may have."""
 
     stream: CameraStream
     tracker: SurfelTracker
@@ -78,6 +90,8 @@ class _State:
     points_px: F32
     ratio: float = 1.0
     segment: int = -1
+    deforms: bool = False
+    cameras: dict[int, tuple[int, F64]] = field(default_factory=dict[int, tuple[int, F64]])
 
 
 def run(bus: Bus, config: Config, monitor: Monitor) -> None:
@@ -109,7 +123,8 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
                 frame = state.tracker.track(image.grey, interval_s, prediction, metres)
             if view is not None:
                 with monitor.stage("births"):
-                    frame, note = _add(state, image.grey, frame, view, config)
+                    frame, note = _add(state, image, frame, view, heard.deforming, config)
+            _note_camera(state, image, frame)
         elif not missing:
             with monitor.stage("start"):
                 frame, missing = _start(state, heard, metres, view, config)
@@ -148,6 +163,9 @@ def _hear(bus: Bus) -> Iterator[_Heard]:
         heard = (replace(h, update=update) for h, update in join(heard, updates))
         keyframes = receive(bus, topics.KEYFRAME, Keyframe)
         heard = (replace(h, keyframe=keyframe) for h, keyframe in join(heard, keyframes))
+    if bus.reads(topics.MAP_DEFORMING):
+        deforming = receive(bus, topics.MAP_DEFORMING, DeformingLandmarks)
+        heard = (replace(h, deforming=found) for h, found in join(heard, deforming))
     return heard
 
 
@@ -163,12 +181,24 @@ def _prediction(state: _State, heard: _Heard) -> F64 | None:
 
 
 def _look_at_map(state: _State, heard: _Heard, config: Config) -> MapView | None:
-    """The state of Pliant's own map in this frame, with or without pixels."""
+    """What Pliant's own map knows of this frame, with or without pixels.
+
+    While the scene deforms, a rigid map is wrong: that of the last seconds counts.
+    """
     if state.map_depth is None or heard.update is None or heard.keyframe is None:
         return None
     p = config.surfels
     max_sigma = p.map_birth_sigma if state.started else p.map_sigma
-    return state.map_depth.take(heard.update, heard.keyframe, heard.frame, max_sigma=max_sigma)
+    view = state.map_depth.take(heard.update, heard.keyframe, heard.frame, max_sigma=max_sigma)
+    found = heard.deforming
+    if found is None or not state.started:
+        return view
+    if found.problem or heard.update.state != TRACKING:
+        state.deforms = False
+    if not len(found.frames):
+        return None if state.deforms else view
+    state.deforms = True
+    return view_of_window(found, state.stream.camera, heard.update.segment)
 
 
 def _start(
@@ -191,21 +221,66 @@ def _start(
 
 
 def _add(
-    state: _State, image: U8, frame: SurfelFrame, view: MapView, config: Config
+    state: _State,
+    image: Image,
+    frame: SurfelFrame,
+    view: MapView,
+    found: DeformingLandmarks | None,
+    config: Config,
 ) -> tuple[SurfelFrame, str]:
-    """Create surfels on a later keyframe of our own map; otherwise return the reason why not."""
+    """Create surfels on a later keyframe of our own map; otherwise return the reason why not.
+
+    found: of a scene that deforms, which corrects the camera, too.
+    """
     if not frame.lost:
-        found = agree(view.depth, frame, config.surfels.patch_px)
-        if found.depth is None:
-            return frame, f"no surfels are created on the map: {found.problem}"
-        state.ratio, state.segment = found.ratio, view.segment
-        return state.tracker.add(image, found.depth), ""
+        agreed = agree(view.depth, frame, config.surfels.patch_px)
+        if agreed.depth is None:
+            return frame, f"no surfels are created on the map: {agreed.problem}"
+        state.ratio, state.segment = agreed.ratio, view.segment
+        if found is not None and len(found.frames):
+            _place(state, found)
+        return state.tracker.add(image.grey, agreed.depth), ""
     # No surfels are left to compare with.  For the same map the last ratio holds.
     if view.segment != state.segment:
         state.ratio, state.segment = 1.0, view.segment
     T_world_camera = view.T_world_camera.copy()
     T_world_camera[:3, 3] *= state.ratio
-    return state.tracker.add(image, state.ratio * view.depth, T_world_camera), ""
+    return state.tracker.add(image.grey, state.ratio * view.depth, T_world_camera), ""
+
+
+def _place(state: _State, found: DeformingLandmarks) -> None:
+    """Place the camera by its motion in a window, since the first of its keyframes that is known:
+    the last one that was placed so, if there is any."""
+    rows = [row for row, frame in enumerate(found.frames.tolist()) if frame in state.cameras]
+    if not rows:
+        return
+    since = state.cameras[int(found.frames[rows[0]])][1]
+    motion = inverse(found.T_world_camera[rows[0]]) @ found.T_world_camera[-1]
+    motion[:3, 3] *= state.ratio
+    T_world_camera = since @ motion
+    frame = state.tracker.place(T_world_camera)
+    state.cameras = {}
+    # Eq. 20 by what the landmarks around do: the camera then follows from what is stiff.
+    tracked = np.flatnonzero(frame.state == SurfelState.TRACKED)
+    squares = ((frame.points_px[tracked, None] - found.points_px) ** 2).sum(axis=2)
+    near = np.argsort(squares, axis=1, kind="stable")[:, :_LANDMARKS]
+    R = T_world_camera[:3, :3] @ found.T_world_camera[-1, :3, :3].T
+    displacements = state.ratio * (found.positions - found.rest)[near].mean(axis=1) @ R.T
+    motion = state.ratio * found.motion[near].mean(axis=1)
+    positions = frame.positions[tracked]
+    depths = transform(inverse(T_world_camera), positions)[:, 2]
+    state.tracker.settle(tracked, positions - displacements, np.hypot(motion, STIFF * depths))
+
+
+def _note_camera(state: _State, image: Image, frame: SurfelFrame) -> None:
+    """Remember where the camera is now, for the next window."""
+    if frame.lost or image.missing:
+        state.cameras = {}
+        return
+    state.cameras[image.frame] = image.stamp_ns, frame.T_world_camera.copy()
+    old = [n for n, (at, _) in state.cameras.items() if image.stamp_ns - at > SPAN_NS]
+    for number in old:
+        del state.cameras[number]
 
 
 def warm_up() -> None:

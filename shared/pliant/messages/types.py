@@ -9,6 +9,7 @@ from typing import Annotated, Any, TypeVar
 
 from pliant.algorithms.arrays import F32, F64, I32, U8, Shape
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.deformable.window import WindowMap
 from pliant.algorithms.inertial.samples import GpsFixes, ImuSamples
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.meshing.mesh_blocks import MeshBlocks, no_rows
@@ -276,6 +277,11 @@ class MeshPiece(Header):
     colours: Annotated[U8, Shape("V", 3)]
     triangles: Annotated[I32, Shape("T", 3)]
     closed: Annotated[I32, Shape("C")] = field(default_factory=no_rows)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeformingLandmarks(Header, WindowMap):
+    """The map of the last seconds of a scene that deforms; most frames have none."""
 
 
 @dataclass(frozen=True, kw_only=True)
