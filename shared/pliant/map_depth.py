@@ -33,11 +33,12 @@ class MapView:
 
 def view_of_window(found: WindowMap, camera: PinholeCamera, segment: int) -> MapView | None:
     """The depth of the newest keyframe of a window, None where its landmarks make no surface."""
-    count = len(found.ids)
+    rows = found.in_view
+    count = len(rows)
     points = SeenPoints(
-        ids=found.ids,
-        points_px=found.points_px,
-        points_world=found.positions,
+        ids=found.ids[rows],
+        points_px=found.points_px[rows],
+        points_world=(found.rest + found.moved()[-1])[rows],
         sigmas=np.full(count, SIGMA / SurfaceParameters().noise_px, np.float32),
         keyframes=np.full(count, len(found.frames), np.int32),
     )

@@ -17,16 +17,13 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.deformable.priors import STIFF
-from pliant.algorithms.deformable.window import SPAN_NS
-from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.image.masks import glaring
-from pliant.algorithms.map_delta import TRACKING
 from pliant.algorithms.surfels.depth_maps import agree
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.prediction import predict
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
+from pliant.algorithms.surfels.window_follower import WindowFollower
 from pliant.algorithms.tracks import FrameTracks
 from pliant.bus.base import Bus, join, receive, receive_one, resume
 from pliant.config import Config
@@ -52,8 +49,6 @@ from pliant_services.runtime.link_images import clearance, receive_images
 from pliant_services.runtime.monitor import Monitor
 
 _FLAT_DEPTH = 1.0
-_LANDMARKS = 4
-"""Of a window, around a surfel."""
 
 
 @dataclass(frozen=True)
@@ -77,9 +72,7 @@ class _Heard:
 class _State:
     """map_depth: if surfels are created on our own map.    stamp_ns, tracks, points_px: of the
     last frame with pixels.    ratio, segment: units of the surfels by one of the map, and the
-    segment of the map, when surfels were last born on it.    deforms: whether the last window of a
-    map that deforms can be trusted.    cameras: stamp and pose of the frames since then that a
-    window may have."""
+    segment of the map, when surfels were last born on it."""
 
     stream: CameraStream
     tracker: SurfelTracker
@@ -90,8 +83,7 @@ class _State:
     points_px: F32
     ratio: float = 1.0
     segment: int = -1
-    deforms: bool = False
-    cameras: dict[int, tuple[int, F64]] = field(default_factory=dict[int, tuple[int, F64]])
+    follower: WindowFollower = field(default_factory=WindowFollower)
 
 
 def run(bus: Bus, config: Config, monitor: Monitor) -> None:
@@ -123,8 +115,8 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
                 frame = state.tracker.track(image.grey, interval_s, prediction, metres)
             if view is not None:
                 with monitor.stage("births"):
-                    frame, note = _add(state, image, frame, view, heard.deforming, config)
-            _note_camera(state, image, frame)
+                    frame, note = _add(state, image, frame, view, config)
+            state.follower.note(image.frame, image.stamp_ns, frame)
         elif not missing:
             with monitor.stage("start"):
                 frame, missing = _start(state, heard, metres, view, config)
@@ -183,22 +175,19 @@ def _prediction(state: _State, heard: _Heard) -> F64 | None:
 def _look_at_map(state: _State, heard: _Heard, config: Config) -> MapView | None:
     """What Pliant's own map knows of this frame, with or without pixels.
 
-    While the scene deforms, a rigid map is wrong: that of the last seconds counts.
+    While the scene deforms a rigid map is wrong: that of the last seconds counts.
     """
     if state.map_depth is None or heard.update is None or heard.keyframe is None:
         return None
     p = config.surfels
     max_sigma = p.map_birth_sigma if state.started else p.map_sigma
     view = state.map_depth.take(heard.update, heard.keyframe, heard.frame, max_sigma=max_sigma)
-    found = heard.deforming
-    if found is None or not state.started:
+    if heard.deforming is None:
         return view
-    if found.problem or heard.update.state != TRACKING:
-        state.deforms = False
-    if not len(found.frames):
-        return None if state.deforms else view
-    state.deforms = True
-    return view_of_window(found, state.stream.camera, heard.update.segment)
+    found = state.follower.take(heard.deforming)
+    if found is not None:
+        return view_of_window(found, state.stream.camera, heard.update.segment)
+    return None if state.follower.deforms else view
 
 
 def _start(
@@ -216,71 +205,32 @@ def _start(
     if metres is None:
         return SurfelFrame.empty(), missing
     frame = state.tracker.start(image, metres, state.stream.camera, T_world_camera)
+    if frame.lost:
+        return SurfelFrame.empty(), f"{WAITING_FOR_DEPTH} where there is texture"
     state.started = True
     return frame, ""
 
 
 def _add(
-    state: _State,
-    image: Image,
-    frame: SurfelFrame,
-    view: MapView,
-    found: DeformingLandmarks | None,
-    config: Config,
+    state: _State, image: Image, frame: SurfelFrame, view: MapView, config: Config
 ) -> tuple[SurfelFrame, str]:
-    """Create surfels on a later keyframe of our own map; otherwise return the reason why not.
-
-    found: of a scene that deforms, which corrects the camera, too.
-    """
-    if not frame.lost:
-        agreed = agree(view.depth, frame, config.surfels.patch_px)
-        if agreed.depth is None:
-            return frame, f"no surfels are created on the map: {agreed.problem}"
-        state.ratio, state.segment = agreed.ratio, view.segment
-        if found is not None and len(found.frames):
-            _place(state, found)
-        return state.tracker.add(image.grey, agreed.depth), ""
-    # No surfels are left to compare with.  For the same map the last ratio holds.
-    if view.segment != state.segment:
-        state.ratio, state.segment = 1.0, view.segment
-    T_world_camera = view.T_world_camera.copy()
-    T_world_camera[:3, 3] *= state.ratio
-    return state.tracker.add(image.grey, state.ratio * view.depth, T_world_camera), ""
-
-
-def _place(state: _State, found: DeformingLandmarks) -> None:
-    """Place the camera by its motion in a window, since the first of its keyframes that is known:
-    the last one that was placed so, if there is any."""
-    rows = [row for row, frame in enumerate(found.frames.tolist()) if frame in state.cameras]
-    if not rows:
-        return
-    since = state.cameras[int(found.frames[rows[0]])][1]
-    motion = inverse(found.T_world_camera[rows[0]]) @ found.T_world_camera[-1]
-    motion[:3, 3] *= state.ratio
-    T_world_camera = since @ motion
-    frame = state.tracker.place(T_world_camera)
-    state.cameras = {}
-    # Eq. 20 by what the landmarks around do: the camera then follows from what is stiff.
-    tracked = np.flatnonzero(frame.state == SurfelState.TRACKED)
-    squares = ((frame.points_px[tracked, None] - found.points_px) ** 2).sum(axis=2)
-    near = np.argsort(squares, axis=1, kind="stable")[:, :_LANDMARKS]
-    R = T_world_camera[:3, :3] @ found.T_world_camera[-1, :3, :3].T
-    displacements = state.ratio * (found.positions - found.rest)[near].mean(axis=1) @ R.T
-    motion = state.ratio * found.motion[near].mean(axis=1)
-    positions = frame.positions[tracked]
-    depths = transform(inverse(T_world_camera), positions)[:, 2]
-    state.tracker.settle(tracked, positions - displacements, np.hypot(motion, STIFF * depths))
-
-
-def _note_camera(state: _State, image: Image, frame: SurfelFrame) -> None:
-    """Remember where the camera is now, for the next window."""
-    if frame.lost or image.missing:
-        state.cameras = {}
-        return
-    state.cameras[image.frame] = image.stamp_ns, frame.T_world_camera.copy()
-    old = [n for n, (at, _) in state.cameras.items() if image.stamp_ns - at > SPAN_NS]
-    for number in old:
-        del state.cameras[number]
+    """Create surfels on a later keyframe of our own map; otherwise return the reason why not."""
+    if frame.lost:
+        # No surfels are left to compare with.  For the same map the last ratio holds.
+        if view.segment != state.segment:
+            state.ratio, state.segment = 1.0, view.segment
+        T_world_camera = view.T_world_camera.copy()
+        T_world_camera[:3, 3] *= state.ratio
+        return state.tracker.add(image.grey, state.ratio * view.depth, T_world_camera), ""
+    state.segment = view.segment
+    if state.follower.deforms:
+        state.ratio = state.follower.place(state.tracker, frame)
+        return state.tracker.add(image.grey, state.ratio * view.depth), ""
+    found = agree(view.depth, frame, config.surfels.patch_px)
+    if found.depth is None:
+        return frame, f"no surfels are created on the map: {found.problem}"
+    state.ratio = found.ratio
+    return state.tracker.add(image.grey, found.depth), ""
 
 
 def warm_up() -> None:

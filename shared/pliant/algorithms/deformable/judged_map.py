@@ -39,11 +39,17 @@ class JudgedMap:
 
 
 def judged_map(
-    ids: Sequence[I64], points_px: Sequence[F64], T_world_camera: F64, camera: PinholeCamera
+    ids: Sequence[I64],
+    points_px: Sequence[F64],
+    T_world_camera: F64,
+    camera: PinholeCamera,
+    *,
+    deforms: bool = False,
 ) -> JudgedMap | str:
     """Adjust K keyframes; where their tracks determine nothing, the reason.
 
     ids, points_px: (N,) and (N, 2) tracks of each.    T_world_camera: (K, 4, 4) start.
+    deforms: whether it is known that the scene deforms: then it may rest for a while.
     """
     size = camera.width, camera.height
     chosen, landmarks = choose_tracks(list(ids), list(points_px), *size)
@@ -60,17 +66,17 @@ def judged_map(
         evidence = weigh(found, held_out, camera)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return TOO_FEW
-    problem = doubt(float(found.reliable.mean()), evidence)
+    problem = doubt(float(found.reliable.mean()), evidence, deforms=deforms)
     return JudgedMap(found=found, tracks=chosen, ids=landmarks, problem=problem)
 
 
-def doubt(certain: float, evidence: Evidence) -> str:
+def doubt(certain: float, evidence: Evidence, *, deforms: bool = False) -> str:
     """Why a map is not to be trusted, "" where it is."""
     if not certain >= _CERTAIN:
         return f"only {certain:.0%} of its landmarks are certain"
     if not evidence.predicted >= _PREDICTED:
         return f"it predicts only {evidence.predicted:.0%} of the tracks that it was not made from"
-    if not evidence.gain >= _GAIN:
+    if not deforms and not evidence.gain >= _GAIN:
         return "a rigid map predicts its tracks as well, or nearly so"
     if not evidence.stiff >= _STIFF:
         return (

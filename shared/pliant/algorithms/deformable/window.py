@@ -16,48 +16,58 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I64, Shape
 from pliant.algorithms.deformable.judged_map import INTERVAL_NS, JudgedMap, judged_map
+from pliant.algorithms.deformable.moving_landmarks import NEAREST
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.slam.calibration.corrected_view import CorrectedView
 
 SPAN_NS = 3_000_000_000
 """Of a window: 2 s determine the shape half as well, 4 s are no better."""
-_FILLED = 0.9
+_FILLED = 0.6
 """Share of it that the first window must cover."""
 _EVERY_NS = 1_000_000_000 - INTERVAL_NS // 2
 """Between two adjustments: a second, less half a keyframe's interval."""
-
 SIGMA = 0.003
 """Standard deviation of a landmark's depth, as a share of it, on rendered scenes."""
 
 
-def _nothing(*shape: int) -> F64:
-    return np.zeros(shape)
+def _none(*shape: int) -> F64:
+    return np.zeros((0, *shape))
+
+
+def _no_rows(*shape: int) -> I64:
+    return np.zeros((0, *shape), np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)
 class WindowMap:
-    """Landmarks in the newest keyframe of a window, and the cameras of all of them.
+    """Certain landmarks of a window; fields as of ``DeformingMap``.
 
     frames: of the keyframes, the newest last; none where nothing was adjusted, or for a problem.
     T_world_camera: theirs; the world is nearly that of the rigid map, the unit that of the first.
-    ids, points_px: of the landmarks in view, as they are tracked.
-    positions, rest: now, and on average over the window; world.
-    motion: how far each is from its rest place, on average over the keyframes (rms).
+    ids, points_px: of the landmarks, where the newest keyframe tracks them, NaN where it does not.
     problem: why the adjustment is not to be trusted, "" where it is.
     """
 
-    frames: Annotated[I64, Shape("K")] = field(default_factory=lambda: np.zeros(0, np.int64))
-    T_world_camera: Annotated[F64, Shape("K", 4, 4)] = field(
-        default_factory=lambda: _nothing(0, 4, 4)
-    )
-    ids: Annotated[I64, Shape("L")] = field(default_factory=lambda: np.zeros(0, np.int64))
+    frames: Annotated[I64, Shape("K")] = field(default_factory=lambda: _no_rows())
+    T_world_camera: Annotated[F64, Shape("K", 4, 4)] = field(default_factory=lambda: _none(4, 4))
+    ids: Annotated[I64, Shape("L")] = field(default_factory=lambda: _no_rows())
     points_px: Annotated[F32, Shape("L", 2)] = field(
         default_factory=lambda: np.zeros((0, 2), np.float32)
     )
-    positions: Annotated[F64, Shape("L", 3)] = field(default_factory=lambda: _nothing(0, 3))
-    rest: Annotated[F64, Shape("L", 3)] = field(default_factory=lambda: _nothing(0, 3))
-    motion: Annotated[F64, Shape("L")] = field(default_factory=lambda: _nothing(0))
+    rest: Annotated[F64, Shape("L", 3)] = field(default_factory=lambda: _none(3))
+    displacements: Annotated[F64, Shape("K", "N", 3)] = field(default_factory=lambda: _none(0, 3))
+    carriers: Annotated[I64, Shape("L", NEAREST)] = field(default_factory=lambda: _no_rows(NEAREST))
+    weights: Annotated[F64, Shape("L", NEAREST)] = field(default_factory=lambda: _none(NEAREST))
     problem: str = ""
+
+    @property
+    def in_view(self) -> I64:
+        """Rows of the landmarks that the newest keyframe tracks."""
+        return np.flatnonzero(np.isfinite(self.points_px[:, 0]))
+
+    def moved(self) -> F64:
+        """(K, L, 3) displacements of the landmarks in each keyframe, world."""
+        return np.einsum("lj,kljc->klc", self.weights, self.displacements[:, self.carriers])
 
 
 @dataclass
@@ -104,6 +114,7 @@ class DeformingWindow:
             [view.pixels(k.points_px).astype(np.float64) for k in keyframes],
             _start(keyframes, rigid),
             view.camera,
+            deforms=keyframes[0].T_world_camera is not None,
         )
         if isinstance(judged, str) or judged.problem:
             for keyframe in keyframes:
@@ -127,16 +138,16 @@ def _start(keyframes: list[_Keyframe], rigid: Mapping[int, F64]) -> F64:
 
 
 def _kept(judged: JudgedMap, keyframes: list[_Keyframe]) -> WindowMap:
-    """What the newest keyframe sees, in the unit of earlier windows, which is kept for later ones.
+    """What the window found, in the unit of earlier windows, which is kept for later ones.
 
     Scaled about the first camera: no pixel changes.
     """
     found, tracks = judged.found, judged.tracks
-    observed = found.reliable[tracks.landmarks]
+    certain = found.reliable[tracks.landmarks]
+    points_px = np.full((len(judged.ids), 2), np.nan, np.float32)
     depths, ratios = list[F64](), list[F64]()
-    landmarks = rows = np.zeros(0, np.int64)
     for k, keyframe in enumerate(keyframes):
-        landmarks = tracks.landmarks[observed & (tracks.keyframes == k)]
+        landmarks = tracks.landmarks[certain & (tracks.keyframes == k)]
         rows = np.searchsorted(keyframe.ids, judged.ids[landmarks])
         z = np.full(len(keyframe.ids), np.nan)
         there = transform(inverse(found.T_world_camera[k]), found.positions(k)[landmarks])
@@ -144,6 +155,8 @@ def _kept(judged: JudgedMap, keyframes: list[_Keyframe]) -> WindowMap:
         depths.append(z)
         both = np.isfinite(z) & np.isfinite(keyframe.depths)
         ratios.append(keyframe.depths[both] / z[both])
+        if keyframe is keyframes[-1]:
+            points_px[landmarks] = keyframe.points_px[rows]
     earlier = np.concatenate(ratios)
     unit = float(np.median(earlier)) if len(earlier) else 1.0
     centre, T = found.T_world_camera[0, :3, 3].copy(), found.T_world_camera.copy()
@@ -154,14 +167,14 @@ def _kept(judged: JudgedMap, keyframes: list[_Keyframe]) -> WindowMap:
     T[:, :3, 3] = scaled(T[:, :3, 3])
     for k, keyframe in enumerate(keyframes):
         keyframe.T_world_camera, keyframe.depths = T[k], unit * depths[k]
-    newest = len(keyframes) - 1  # landmarks and rows are its
-    moved = np.stack([found.positions(k)[landmarks] for k in range(len(keyframes))])
+    kept = np.flatnonzero(found.reliable)
     return WindowMap(
         frames=np.array([keyframe.frame for keyframe in keyframes], np.int64),
         T_world_camera=T,
-        ids=judged.ids[landmarks],
-        points_px=keyframes[newest].points_px[rows],
-        positions=scaled(found.positions(newest)[landmarks]),
-        rest=scaled(found.rest[landmarks]),
-        motion=unit * np.sqrt(((moved - found.rest[landmarks]) ** 2).sum(axis=2).mean(axis=0)),
+        ids=judged.ids[kept],
+        points_px=points_px[kept],
+        rest=scaled(found.rest[kept]),
+        displacements=unit * found.displacements,
+        carriers=found.carriers[kept],
+        weights=found.weights[kept],
     )
