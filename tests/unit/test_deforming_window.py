@@ -150,7 +150,7 @@ def test_surfels_follow_a_window_in_its_unit() -> None:
         weights=weights,
     )
     assert follower.take(window) is window
-    ratio = follower.place(tracker, second)
+    ratio = follower.place(tracker, second, 1.0)
     assert ratio == pytest.approx(2.0, rel=0.01)
     after = tracker.add(images[1], np.zeros_like(depth))
     placed = first.T_world_camera @ T[1]
@@ -161,7 +161,5 @@ def test_surfels_follow_a_window_in_its_unit() -> None:
     moves = tracker._table.sigmas > 0.015  # 0.02, where the others have 0.003 of 1 m
     near_edge = np.abs(there[:, 0]) < 0.1
     np.testing.assert_array_equal(moves[~near_edge], half[~near_edge] > 0.0)
-    # Untrusted: its ratio is forgotten.
     assert follower.take(WindowMap(problem="it is wrong")) is None
     assert not follower.deforms
-    assert not follower.ratio

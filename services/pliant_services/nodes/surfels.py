@@ -224,7 +224,7 @@ def _add(
         return state.tracker.add(image.grey, state.ratio * view.depth, T_world_camera), ""
     state.segment = view.segment
     if state.follower.deforms:
-        state.ratio = state.follower.place(state.tracker, frame)
+        state.ratio = state.follower.place(state.tracker, frame, state.ratio)
         return state.tracker.add(image.grey, state.ratio * view.depth), ""
     found = agree(view.depth, frame, config.surfels.patch_px)
     if found.depth is None:

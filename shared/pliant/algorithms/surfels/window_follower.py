@@ -22,88 +22,69 @@ _FEWEST = 8
 """Surfels that determine a unit."""
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """The camera (4, 4) of a frame, and its tracked surfels in it (S, 3)."""
-
-    stamp_ns: int
-    T_world_camera: F64
-    in_camera: F64
-
-
 @dataclass
 class WindowFollower:
-    """deforms: whether the last window is trusted.    ratio: units of the surfels by one of the
-    windows, 0 before the first of those that continue each other.    seen: frames that a window may
-    have, since the last one that placed the camera."""
+    """deforms: whether the last window is trusted.    cameras: stamp, and T_world_camera (4, 4), of
+    frames that a window may have, since the last one that placed the camera.
+    newest: the last window with landmarks."""
 
     deforms: bool = False
-    ratio: float = 0.0
-    seen: dict[int, _Seen] = field(default_factory=dict[int, _Seen])
+    cameras: dict[int, tuple[int, F64]] = field(default_factory=dict[int, tuple[int, F64]])
     newest: WindowMap | None = None
 
     def note(self, frame: int, stamp_ns: int, surfels: SurfelFrame) -> None:
         """Remember a frame, which must have pixels."""
         if surfels.lost:
-            self.seen = {}
+            self.cameras = {}
             return
-        tracked = surfels.state == SurfelState.TRACKED
-        T = surfels.T_world_camera.copy()
-        in_camera = transform(inverse(T), surfels.positions[tracked])
-        self.seen[frame] = _Seen(stamp_ns, T, in_camera)
-        for old in [n for n, seen in self.seen.items() if stamp_ns - seen.stamp_ns > SPAN_NS]:
-            del self.seen[old]
+        self.cameras[frame] = stamp_ns, surfels.T_world_camera.copy()
+        for old in [n for n, (at, _) in self.cameras.items() if stamp_ns - at > SPAN_NS]:
+            del self.cameras[old]
 
     def take(self, found: WindowMap) -> WindowMap | None:
         """The window of a frame, if it has one that is trusted."""
         if found.problem:
-            self.deforms, self.ratio = False, 0.0
+            self.deforms = False
         if not len(found.frames):
             return None
         self.deforms, self.newest = True, found
         return found
 
-    def place(self, tracker: SurfelTracker, surfels: SurfelFrame) -> float:
-        """Place the camera by the newest window; returns the ratio.
+    def place(self, tracker: SurfelTracker, surfels: SurfelFrame, ratio: float) -> float:
+        """Place the camera by the newest window; returns units of the surfels by one of the window.
 
-        surfels: in the newest keyframe.    The camera moves as in the window, since the first of
-        its keyframes that is known: if possible the last one that was placed so.
+        surfels: in the newest keyframe.    ratio: before.    The camera moves as in the window,
+        since the first of its keyframes that is known: if possible the last one that was placed so.
         """
         found = self.newest
         assert found is not None
-        rows = [row for row, frame in enumerate(found.frames.tolist()) if frame in self.seen]
-        if not rows:
-            return self.ratio or 1.0
-        since = self.seen[int(found.frames[rows[0]])]
-        self.seen = {}
-        if not self.ratio:
-            self.ratio = _ratio(found, rows[0], since)
-        motion = inverse(found.T_world_camera[rows[0]]) @ found.T_world_camera[-1]
-        motion[:3, 3] *= self.ratio
-        T_world_camera = since.T_world_camera @ motion
-        _settle(tracker, tracker.place(T_world_camera), found, self.ratio)
-        return self.ratio
+        ratio = _ratio(found, surfels) or ratio
+        rows = [row for row, frame in enumerate(found.frames.tolist()) if frame in self.cameras]
+        if rows:
+            motion = inverse(found.T_world_camera[rows[0]]) @ found.T_world_camera[-1]
+            motion[:3, 3] *= ratio
+            surfels = tracker.place(self.cameras[int(found.frames[rows[0]])][1] @ motion)
+        self.cameras = {}
+        _settle(tracker, surfels, found, ratio)
+        return ratio
 
 
-def _ratio(found: WindowMap, row: int, seen: _Seen) -> float:
-    """Units of the surfels by one of the window, in one of its keyframes: 1 for too few surfels."""
-    points = found.rest + found.moved()[row]
-    points = transform(inverse(found.T_world_camera[row]), points)
-    points = points[points[:, 2] > 0.0]
-    there = seen.in_camera[seen.in_camera[:, 2] > 0.0]
-    if len(there) < _FEWEST or len(points) < _AROUND:
-        return 1.0
-    near = _nearest(there[:, :2] / there[:, 2:], points[:, :2] / points[:, 2:])
-    return float(np.median(there[:, 2] / points[near, 2].mean(axis=1)))
+def _ratio(found: WindowMap, surfels: SurfelFrame) -> float:
+    """Units of the surfels by one of the window, 0 if too few surfels are tracked."""
+    tracked = np.flatnonzero(surfels.state == SurfelState.TRACKED)
+    if len(tracked) < _FEWEST:
+        return 0.0
+    near = _landmarks_around(found, surfels, tracked)
+    landmarks = transform(inverse(found.T_world_camera[-1]), found.rest + found.moved()[-1])
+    depths = transform(inverse(surfels.T_world_camera), surfels.positions[tracked])[:, 2]
+    return float(np.median(depths / landmarks[near, 2].mean(axis=1)))
 
 
 def _settle(tracker: SurfelTracker, surfels: SurfelFrame, found: WindowMap, ratio: float) -> None:
     """Surfels rest where the landmarks around them do, and move as far."""
     T = surfels.T_world_camera
     tracked = np.flatnonzero(surfels.state == SurfelState.TRACKED)
-    in_view = found.in_view
-    landmarks_px = found.points_px[in_view].astype(np.float64)
-    near = in_view[_nearest(surfels.points_px[tracked].astype(np.float64), landmarks_px)]
+    near = _landmarks_around(found, surfels, tracked)
     moved = ratio * found.moved()[:, near].mean(axis=2)  # (K, S, 3), the window's axes
     now = moved[-1] @ (T[:3, :3] @ found.T_world_camera[-1, :3, :3].T).T
     positions = surfels.positions[tracked]
@@ -112,7 +93,8 @@ def _settle(tracker: SurfelTracker, surfels: SurfelFrame, found: WindowMap, rati
     tracker.settle(tracked, positions - now, np.hypot(sizes, STIFF * depths))
 
 
-def _nearest(points: F64, others: F64) -> I64:
-    """(P, _AROUND) rows of the nearest others of points (P, 2)."""
-    squares = ((points[:, None] - others[None]) ** 2).sum(axis=2)
-    return np.argsort(squares, axis=1, kind="stable")[:, :_AROUND]
+def _landmarks_around(found: WindowMap, surfels: SurfelFrame, tracked: I64) -> I64:
+    """(S, _AROUND) the nearest landmarks in the image."""
+    rows = found.in_view
+    apart = surfels.points_px[tracked, None].astype(np.float64) - found.points_px[rows]
+    return rows[np.argsort((apart**2).sum(axis=2), axis=1, kind="stable")[:, :_AROUND]]
