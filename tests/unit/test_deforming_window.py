@@ -131,20 +131,21 @@ def test_surfels_follow_a_window_in_its_unit() -> None:
     first = tracker.start(images[0], depth, camera)
     follower.note(0, 0, first)
     second = tracker.track(images[1], STEP_S)
-    # The same scene in units of 2 m; the camera has turned and is elsewhere, and half has moved.
-    there = transform(inverse(first.T_world_camera), first.positions)
+    # The same scene in units of 2 m; the camera has turned and is elsewhere, some of it has moved.
+    there = transform(inverse(second.T_world_camera), second.positions)
     T = np.stack([np.eye(4), np.eye(4)])
     T[1, :3, :3], T[1, :3, 3] = so3_exp(np.array([0.0, 0.01, 0.0])), (0.02, 0.0, 0.0)
-    half = (there[:, 0] > 0.0).astype(np.float64)
+    some = (there[:, 0] > np.quantile(there[:, 0], 0.8)).astype(np.float64)
     displacements = np.zeros((2, 2, 3))
     displacements[:, 1, 2] = (-0.01, 0.01)
-    weights = np.stack([1.0 - half, half, 0.0 * half, 0.0 * half], axis=1)
+    newest = transform(T[1], 0.5 * there)
+    weights = np.stack([1.0 - some, some, 0.0 * some, 0.0 * some], axis=1)
     window = WindowMap(
         frames=np.array([0, 1]),
         T_world_camera=T,
         ids=np.arange(len(there)),
         points_px=second.points_px.astype(np.float32),
-        rest=0.5 * there + half[:, None] * (0.0, 0.0, 0.01),
+        rest=newest - some[:, None] * (0.0, 0.0, 0.01),
         displacements=displacements,
         carriers=np.tile(np.arange(4) % 2, (len(there), 1)),
         weights=weights,
@@ -152,14 +153,14 @@ def test_surfels_follow_a_window_in_its_unit() -> None:
     assert follower.take(window) is window
     ratio = follower.place(tracker, second, 1.0)
     assert ratio == pytest.approx(2.0, rel=0.01)
-    after = tracker.add(images[1], np.zeros_like(depth))
     placed = first.T_world_camera @ T[1]
     placed[:3, 3] = ratio * T[1, :3, 3]
-    np.testing.assert_allclose(after.T_world_camera, placed, atol=1e-9)
-    np.testing.assert_array_equal(after.ids, second.ids)
-    np.testing.assert_allclose(after.points_px, second.points_px, atol=1e-3)
-    moves = tracker._table.sigmas > 0.015  # 0.02, where the others have 0.003 of 1 m
-    near_edge = np.abs(there[:, 0]) < 0.1
-    np.testing.assert_array_equal(moves[~near_edge], half[~near_edge] > 0.0)
+    added = tracker.add(images[1], np.zeros_like(depth))
+    np.testing.assert_allclose(added.T_world_camera, placed, atol=1e-9)
+    np.testing.assert_allclose(added.points_px, second.points_px, atol=1e-3)
+    # The same image again: what is stiff keeps the camera where it is.
+    again = tracker.track(images[1], STEP_S)
+    np.testing.assert_array_equal(again.ids, second.ids)
+    np.testing.assert_allclose(again.T_world_camera[:3, 3], placed[:3, 3], atol=3e-3)
     assert follower.take(WindowMap(problem="it is wrong")) is None
     assert not follower.deforms
