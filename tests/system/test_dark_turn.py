@@ -42,7 +42,9 @@ def test_dark_frames_are_placed_by_the_gyro(tmp_path: Path) -> None:
     )  # fmt: skip
     imu = write_imu_csv(tmp_path / "imu.csv", samples)
     result = tmp_path / "result"
-    done = in_this_process("run", folder, "--imu", imu, *NO_MESH, "--output", result)
+    done = in_this_process(
+        "run", folder, "--imu", imu, *NO_MESH, "--on-crash", "restart", "--output", result
+    )
     assert done.returncode == 0, done.stderr
     assert (
         f"{len(DARK)} frames without a pose by images, placed by the gyro between others"

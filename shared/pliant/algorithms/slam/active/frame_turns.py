@@ -73,7 +73,7 @@ class FrameTurns:
         gyro, stamp_ns, last = self.gyro, placed.frame.stamp_ns, self.last
         if gyro is None or gyro.is_over:
             return
-        R, here = placed.T_world_camera[:3, :3], self.here
+        R, here = placed.T_world_camera[:3, :3].copy(), self.here
         if here is None:
             here = ByImage(stamp_ns=stamp_ns, R=R, variance=0.0)
         before_ns, before = motion.stamps_ns[1], motion.poses[1][:3, :3]
