@@ -154,7 +154,8 @@ def reach_back(
     if samples is not None and len(samples.stamps_ns):
         # Samples need the frames of both passes, relative to keyframes that are nearly final.
         with_samples = deepcopy(mapper)
-        delta = with_samples.finish(samples=samples, placed=collected.placed())
+        with_samples.add_samples(samples)
+        delta = with_samples.finish(placed=collected.placed())
         found.counters = with_samples.counters
         if found.counters.get("coupling_outcome") == CouplingOutcome.MOVED:
             mapper = with_samples

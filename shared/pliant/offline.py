@@ -43,10 +43,9 @@ class Pipeline:
         history: MapHistory,
         timer: StageTimer = no_stages,
         places: KnownPlaces | None = None,
-        samples: ImuSamples | None = None,
     ) -> None:
         """timer: of the stages of both.    places: where the camera may be recognised, instead of a
-        mapper's own.   samples: inertial, of the whole source.
+        mapper's own.
         """
         self.history = history
         self._timer = timer
@@ -54,11 +53,15 @@ class Pipeline:
         camera = self._rectifier.camera
         self._tracker = ExtremaTracker(camera.width, camera.height, config.tracking, config.seed)
         self._mapper = mapper_for(
-            camera, config.bundle_adjustment, config.seed, calibration.focal_sigma, samples=samples
+            camera, config.bundle_adjustment, config.seed, calibration.focal_sigma
         )
         if places is not None and isinstance(self._mapper, Mapper):
             self._mapper.atlas.places = places
         self._last = 0
+
+    def add_samples(self, samples: ImuSamples) -> None:
+        """Take in the next inertial samples of the source."""
+        self._mapper.add_samples(samples)
 
     def take(self, source: SourceFrame) -> MappedFrame:
         """Track and map the next frame."""
@@ -78,9 +81,9 @@ class Pipeline:
         self._last = image.frame
         return MappedFrame(image, tracks, delta)
 
-    def finish(self, timer: StageTimer = no_stages, samples: ImuSamples | None = None) -> MapDelta:
-        """The corrections at the end of the stream.   samples: inertial, that came meanwhile."""
-        delta = self._mapper.finish(timer, samples)
+    def finish(self, timer: StageTimer = no_stages) -> MapDelta:
+        """The corrections at the end of the stream."""
+        delta = self._mapper.finish(timer)
         self.history.apply(delta, frame=self._last, stamp_ns=0, final=True)
         return delta
 

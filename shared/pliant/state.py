@@ -24,6 +24,7 @@ import msgpack
 import numpy as np
 from pydantic import BaseModel
 
+from pliant.algorithms.inertial.samples import BLOCK_BYTES, bytes_of
 from pliant.errors import StateError
 from pliant.version import __version__
 
@@ -42,7 +43,7 @@ _CLASSES = {
 """Classes that are neither dataclasses, named tuples, nor parameters."""
 _FUNCTIONS = {"no_stages"}
 _CONSTANT = {"GyroSignal", "ImuSamples"}
-"""Records that never change: a state names them where there is a store for them."""
+"""Records that never change: a state names large ones where there is a store for them."""
 
 _PLAIN = (type(None), bool, float, str, bytes)
 _LIMIT = 1 << 62
@@ -145,7 +146,8 @@ class _Writer:
             return ["named", *self._class(kind), [self.reference(item) for item in value]]
         if callable(value) and hasattr(value, "__qualname__"):
             return ["name", *_name(value)]
-        if self._constants is not None and kind.__name__ in _CONSTANT:
+        is_constant = kind.__name__ in _CONSTANT and bytes_of(value) >= BLOCK_BYTES
+        if is_constant and self._constants is not None:
             return ["constant", self._constants.keep(value)]
         attributes = {key: self.reference(item) for key, item in _attributes(value).items()}
         return ["object", *self._class(kind), attributes]

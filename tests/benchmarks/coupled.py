@@ -54,7 +54,9 @@ def measure(motions: Path | None, names: Sequence[str], frames: int, seeds: int)
 def _finished(made: Pipeline, truth: Trajectory, given: ImuSamples | None) -> tuple[float, str]:
     """RMSE of the longest segment, and a note if the samples did not move its keyframes."""
     ended = deepcopy(made)
-    ended.finish(samples=given)
+    if given is not None:
+        ended.add_samples(given)
+    ended.finish()
     history = ended.history
     found = history.trajectory_in(history.longest_segment(), history.final())
     ate = evaluate_trajectory(found, truth).ate_m

@@ -67,7 +67,9 @@ def run(dataset: Dataset, covered: range, seed: int, given: ImuSamples | None) -
     history = MapHistory()
     config = load_config(None, [f"seed={seed}"])
     frames = RoughFrames(dataset, case)
-    pipeline = Pipeline(dataset.calibration, config, history, samples=given)
+    pipeline = Pipeline(dataset.calibration, config, history)
+    if given is not None:
+        pipeline.add_samples(given)
     count = 0
     for source in cast(Dataset, frames):
         pipeline.take(source)

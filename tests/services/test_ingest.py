@@ -349,33 +349,70 @@ def test_other_sensors_come_before_the_first_frame_and_are_recorded(tmp_path: Pa
 
 
 class HearingDataset(FakeDataset):
-    """Of a live source whose sensor measures once an image."""
+    """Of a live source whose sensor measures once an image, and twice after the last."""
+
+    has_imu = True
+    given = 0
+
+    def next_imu(self) -> ImuSamples:
+        stamps = STEP_NS * np.arange(len(self.data) + 2)[self.given : self.given + 1]
+        self.given += 1
+        values = np.ones((len(stamps), 3))
+        return ImuSamples(stamps_ns=stamps, gyro_rad_s=values, accel_m_s2=values)
 
     def heard(self) -> Measurements:
-        stamps = STEP_NS * np.arange(len(self.data))
-        values = np.ones((len(stamps), 3))
-        samples = ImuSamples(stamps_ns=stamps, gyro_rad_s=values, accel_m_s2=values)
-        return Measurements(imu=samples)
+        one = np.ones(1)
+        return Measurements(
+            gps=GpsFixes(
+                stamps_ns=np.zeros(1, np.int64), latitude_deg=one, longitude_deg=one,
+                altitude_m=one, sigma_m=np.ones((1, 3)),
+            )
+        )  # fmt: skip
 
 
-def test_what_a_live_source_hears_comes_after_the_last_frame() -> None:
-    bus = ReplayBus({})
-    ingest.run(bus, Config(), Counters(), HearingDataset([png(0), png(1)]), lambda: False)
+@pytest.mark.parametrize("is_live", [False, True])
+def test_what_a_live_source_hears_comes_with_the_frames(is_live: bool) -> None:
+    """Also with those that live mode leaves out."""
+    published: list[tuple[Topic, int]] = []
+
+    class Order(ReplayBus):
+        def publish(self, topic: Topic, message: Header, **how: Any) -> None:
+            published.append((topic, message.frame))
+            super().publish(topic, message, **how)
+
+    bus = Order({})
+    dataset = HearingDataset([png(0), png(1)], is_live=is_live)
+    ingest.run(bus, Config(), Counters(), dataset, lambda: False)
     (stream,) = bus.outputs[topics.STREAM]
     assert isinstance(stream, CameraStream)
     assert stream.sensors_last
-    order = list(bus.outputs)
-    assert order.index(topics.IMU) > order.index(topics.IMAGE)
-    assert len(imu_in(bus.outputs[topics.IMU]).stamps_ns) == 2
+    assert stream.imu_by_frame
+    both = [each for each in published if each[0] in (topics.IMU, topics.IMAGE)]
+    first = [(topic, frame) for frame in range(2) for topic in (topics.IMU, topics.IMAGE)]
+    assert both == [*first, (topics.IMU, 2), (topics.IMU, 3)]
+    samples = imu_in(bus.outputs[topics.IMU])
+    assert samples.stamps_ns.tolist() == [STEP_NS * number for number in range(4)]
+    assert published[-1][0] == topics.GPS
     ended = bus.ended
     assert ended.index(topics.IMAGE) < ended.index(topics.IMU) < ended.index(topics.GPS)
 
 
-def test_what_a_source_that_fails_has_heard_is_sent_as_incomplete() -> None:
+def test_a_live_source_that_hears_no_samples_sends_none() -> None:
+    bus, dataset = ReplayBus({}), HearingDataset([png(0)])
+    dataset.has_imu = False
+    ingest.run(bus, Config(), Counters(), dataset, lambda: False)
+    (stream,) = bus.outputs[topics.STREAM]
+    assert isinstance(stream, CameraStream)
+    assert not stream.imu_by_frame
+    assert topics.IMU not in bus.outputs
+    assert topics.IMU in bus.ended
+
+
+def test_what_a_source_that_fails_reaches_is_sent_as_incomplete() -> None:
     bus, dataset = ReplayBus({}), HearingDataset([png(i) for i in range(5)], fails_at=3)
     with pytest.raises(SourceLostError):
         ingest.run(bus, Config(), Counters(), dataset, lambda: False)
-    assert len(imu_in(bus.outputs[topics.IMU]).stamps_ns) == 5
+    assert len(imu_in(bus.outputs[topics.IMU]).stamps_ns) == 7
     assert set(bus.cut_off) == {topics.IMAGE, topics.IMU, topics.GPS}
 
 

@@ -164,6 +164,9 @@ def test_what_samples_did_to_the_keyframes_is_reported() -> None:
     report["coupling"]["refusal"] = "the focal length changes"
     report["inertial_refusal"] = "the gyro explains 12 %"  # one refusal is enough
     assert not [line for line in summary(report) if "the keyframes" in line]
+    report["counters"] = {"bundle_adjustment": {"gyro_late": 3.0}}
+    late = "3 frames without a prediction by the gyro: samples of their time had not come"
+    assert late in summary(report)
 
 
 def test_one_is_not_many(tmp_path: Path) -> None:

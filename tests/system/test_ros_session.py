@@ -17,6 +17,7 @@ from running import UP, assert_one_line, command, in_this_process, running
 
 from pliant.bus.session import free_endpoint, open_router, open_session
 from pliant.datasets import decode, open_source
+from pliant.messages import topics
 from pliant.recording.measured import fixes_of, imu_of
 from pliant.recording.reader import Recording
 
@@ -136,6 +137,10 @@ def test_a_camera_of_ros_is_mapped_and_published_in_ros(tmp_path: Path) -> None:
     assert len(samples.stamps_ns) >= tiny.frame_count
     assert len(fixes_of(recording).stamps_ns) >= tiny.frame_count
     assert samples.gyro_rad_s[-1].tolist() == [0.1, 0.2, 0.3]
+    pieces = [piece.frame for piece in recording.decoded(topics.IMU)]
+    assert pieces[: report["frames"]] == list(range(report["frames"]))
+    done = in_this_process("replay", recording.path, "--check", "-o", tmp_path / "again")
+    assert done.returncode == 0, done.stdout + done.stderr
     seen = watcher.seen
     assert {p.header.frame_id for p in seen["pliant/pose"]} == {"map"}
     positions = [(p.pose.position.x, p.pose.position.y) for p in seen["pliant/pose"]]

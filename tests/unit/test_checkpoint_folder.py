@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.inertial.preintegration import GyroSignal
+from pliant.algorithms.inertial.samples import append, joined
 from pliant.bus.checkpoints import Checkpoints, Place
 from pliant.errors import BusError, StateError
 from pliant.state import load_state, save_state
@@ -27,7 +28,7 @@ def test_a_folder_of_another_user_names_the_user_to_run_as(
 
 
 def signal() -> GyroSignal:
-    return GyroSignal(times_s=np.arange(1000.0), gyro=np.ones((1000, 3)))
+    return GyroSignal(times_s=np.arange(1e4), gyro=np.ones((10_000, 3)))
 
 
 def saved(folder: Path, store: Checkpoints, frame: int, state: object) -> int:
@@ -52,6 +53,22 @@ def test_what_never_changes_is_written_once_and_comes_back(tmp_path: Path) -> No
     np.testing.assert_array_equal(found["signal"].gyro, kept.gyro)
     saved(tmp_path, restarted, 3, found)
     assert len(list(tmp_path.glob("*.constant"))) == 1
+
+
+def test_blocks_that_are_full_are_written_once(tmp_path: Path) -> None:
+    """Samples of a live source grow: what may still change is part of each state."""
+    store, blocks, more = Checkpoints(tmp_path, interval=1), list[GyroSignal](), signal()
+    for frame in range(40):
+        rows = slice(250 * frame, 250 * (frame + 1))
+        append(blocks, GyroSignal(times_s=more.times_s[rows], gyro=more.gyro[rows]))
+        saved(tmp_path, store, frame, blocks)
+    assert len(blocks) == len(list(tmp_path.glob("*.constant"))) + 1 == 2
+    restarted = Checkpoints(tmp_path, interval=1)
+    place = restarted.usable({})
+    assert place is not None
+    found = joined(load_state(restarted.restart_from(place), restarted))
+    np.testing.assert_array_equal(found.times_s, more.times_s)
+    np.testing.assert_array_equal(found.gyro, more.gyro)
 
 
 def test_a_state_whose_constant_is_gone_is_one_error(tmp_path: Path) -> None:

@@ -41,12 +41,12 @@ def seen(frame: int, count: int) -> Frame:
 class WrongGyro:
     """It is sure of turns that are wrong by a constant."""
 
-    is_over, counters = False, {}
+    is_over, counters, frames = False, {}, 0
 
     def __init__(self) -> None:
         self.shown: list[tuple[F64, float]] = []
 
-    def turn(self, first_ns: int, second_ns: int) -> GyroTurn:
+    def predict(self, first_ns: int, second_ns: int) -> GyroTurn:
         frames = round((second_ns - first_ns) / STEP_NS)
         wrong = so3_exp(np.array([0.0, -0.01 * frames + 1e-3, 0.0]))
         return GyroTurn(R=wrong, covariance=1e-10 * np.eye(3))

@@ -1,5 +1,6 @@
 """How the gyro tells the turns of a camera, and when it is not believed."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 
@@ -116,6 +117,63 @@ def test_a_gyro_that_stops_to_fit_is_dropped() -> None:
     assert gyro.dropped
     assert len(gyro.signal.times_s) == 2
     assert gyro.turn(int(motion.stamps_ns[150]), int(motion.stamps_ns[151])) is None
+
+
+def piece(given: ImuSamples, first_ns: float, last_ns: float) -> ImuSamples:
+    """The samples of an interval, without its begin."""
+    rows = (given.stamps_ns > first_ns) & (given.stamps_ns <= last_ns)
+    return ImuSamples(**{name: values[rows] for name, values in vars(given).items()})
+
+
+def hearing(given: ImuSamples, until_ns: list[float]) -> Iterator[tuple[int, Gyro]]:
+    """The number of each frame but the first, and the gyro that has heard the samples by then.
+
+    until_ns: time of the last of these, for each frame.
+    """
+    gyro = gyro_of(piece(given, -np.inf, until_ns[10]))
+    for now in range(1, len(until_ns)):
+        if now > 10:
+            gyro.add_samples(piece(given, until_ns[now - 1], until_ns[now]))
+        yield now, gyro
+
+
+@pytest.mark.parametrize("late_s", [-0.01, 0.02])
+def test_a_gyro_is_heard_while_frames_come(late_s: float) -> None:
+    """Samples that are late by a part of a frame predict none, but are known in the end."""
+    motion = hand_held(150.0)
+    given, stamps, R = samples(motion), motion.stamps_ns.tolist(), seen(motion)
+    whole, predicted, apart = gyro_of(given), 0, list[float]()
+    for now, gyro in hearing(given, [stamp + 1e9 * (0.08 - late_s) for stamp in stamps]):
+        predicted += gyro.predict(stamps[now - 1], stamps[now]) is not None
+        for each in (gyro, whole):
+            each.see(stamps[now - 1], stamps[now], R[now - 1].T @ R[now])
+        turns = [each.turn(stamps[now - 15], stamps[now - 5]) for each in (gyro, whole)]
+        if turns[0] is not None and turns[1] is not None:
+            apart.append(float(np.linalg.norm(so3_log(turns[0].R.T @ turns[1].R))))
+    assert len(gyro.blocks) > 1
+    assert gyro.is_believed
+    assert not gyro.dropped
+    all_but_first = len(stamps) - 140  # before it is believed
+    if late_s < 0.0:
+        assert predicted > all_but_first
+        assert gyro.late <= 1
+    else:
+        assert gyro.late > all_but_first
+        assert predicted == 0
+    assert len(apart) > all_but_first
+    assert np.degrees(max(apart)) < 0.2
+
+
+@pytest.mark.parametrize("spoil", [turned_back, left_handed, in_degrees])
+def test_a_wrong_gyro_that_is_heard_late_is_never_believed(spoil) -> None:
+    motion = hand_held(30.0)
+    stamps, R = motion.stamps_ns.tolist(), seen(motion)
+    given = spoil(samples(motion))
+    for now, gyro in hearing(given, [stamp + 1e9 * (0.08 - 0.1) for stamp in stamps]):
+        assert gyro.predict(stamps[now - 1], stamps[now]) is None
+        gyro.see(stamps[now - 1], stamps[now], R[now - 1].T @ R[now])
+    assert not gyro.is_believed
+    assert gyro.late <= 1
 
 
 def test_turns_are_forgotten_after_two_minutes() -> None:

@@ -2,7 +2,8 @@
 
 in   camera/stream    once
      map/known        before the first frame: a map of earlier sessions, to continue in
-     imu/samples      the inertial samples of the source, before the first frame or after the last
+     imu/samples      the inertial samples of the source, before the first frame; of a live source
+                      those that came since, before every frame and after the last
      camera/image     every frame: colours, and for re-acquisition patches and maxima of curvature;
                       in live mode, whether to map the frame, or only to localise it by its tracks
      tracks/extrema   every frame
@@ -18,6 +19,7 @@ Global bundle adjustment runs in a thread, in parallel with tracking, see ``glob
 """
 
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import islice
 from typing import TypeAlias
 
 import cv2
@@ -77,25 +79,29 @@ _JPEG_QUALITY = 95
 def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     """Map until the tracks end."""
 
-    def start() -> tuple[Header, FrameMapper, dict[int, _Kept], bool]:
+    def start() -> tuple[Header, FrameMapper, dict[int, _Kept], bool, bool]:
         stream = receive_one(bus, topics.STREAM, CameraStream)
         # In the order of the sender, which waits for its readers after some messages.  A recording
         # of an earlier release has no topic of samples.
         has_samples, later = bus.reads(topics.IMU), stream.sensors_last
-        samples = imu_in(bus.receive(topics.IMU)) if has_samples and not later else None
+        samples = imu_in(bus.receive(topics.IMU) if has_samples and not later else ())
         known: list[MapKeyframe] = []
         if bus.reads(topics.MAP_KNOWN):
             known += receive(bus, topics.MAP_KNOWN, MapKeyframe)
         parameters, sigma = config.bundle_adjustment, stream.focal_sigma
-        mapper = mapper_for(stream.camera, parameters, config.seed, sigma, known, samples)
-        return stream, mapper, {}, has_samples and later
+        mapper = mapper_for(stream.camera, parameters, config.seed, sigma, known)
+        mapper.add_samples(samples)
+        return stream, mapper, {}, has_samples and later, has_samples and stream.imu_by_frame
 
     # waiting: images and masks of the frames from which a map may yet start, by frame number.
-    # later: samples come after the last frame, in time for the last adjustment.
-    last, mapper, waiting, later = resume(bus, start)
+    # later: samples come after the last frame.   by_frame: others precede each frame.
+    last, mapper, waiting, later, by_frame = resume(bus, start)
     extrema = receive(bus, topics.EXTREMA, Extrema)
+    pieces = bus.receive(topics.IMU) if later else iter(())
     worker = AdjustmentWorker()
     for image, tracks in join(receive_images(bus, mapped_only=True), extrema):
+        if by_frame:
+            mapper.add_samples(imu_in(islice(pieces, 1)))
         if tracks.missing:
             delta = mapper.skip(tracks.frame)
         elif image.unplaced:
@@ -131,10 +137,10 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
         )
         last = Header(frame=tracks.frame, stamp_ns=tracks.stamp_ns, frame_id=tracks.frame_id)
         worker.start(mapper.global_adjustment)
-        bus.checkpoint(tracks.frame, (last, mapper, waiting, later))
-    samples = imu_in(bus.receive(topics.IMU)) if later else None
+        bus.checkpoint(tracks.frame, (last, mapper, waiting, later, by_frame))
+    mapper.add_samples(imu_in(pieces))
     with monitor.stage("finish"):
-        final = mapper.finish(samples=samples)
+        final = mapper.finish()
     bus.publish(topics.MAP_FINAL, _update(last, final))
     keyframes = _keyframe(last, mapper.publish_keyframes(), final, waiting)
     bus.publish(topics.KEYFRAME_FINAL, keyframes)

@@ -4,8 +4,9 @@ in   an image folder, a video, a camera, a built-in sequence
 out  camera/stream   once: the camera
      camera/clip     before the first frame: the file of a video, where that is smaller than frames
      imu/samples     before the first frame: the inertial samples of the source, where it has any;
-                     of a live source, which hears them meanwhile, after the last
-     gps/fixes       the same: its satellite fixes
+                     of a live source, which hears them meanwhile, before each frame and after the
+                     last: those since the frame before
+     gps/fixes       before the first frame, or after the last: its satellite fixes
      map/known       before the first frame: the keyframes of a map of earlier sessions
      camera/source   every frame: its bytes as they came
      camera/image    every frame: rectified; empty where it was dropped or does not decode; over a
@@ -26,8 +27,8 @@ from pliant.config import Config
 from pliant.datasets.base import Dataset, SourceFrame
 from pliant.datasets.calibration import calibration_yaml
 from pliant.datasets.clip import Clip, clip_of
-from pliant.datasets.measured.base import NOTHING, Measurements
-from pliant.datasets.measured.found import heard_by
+from pliant.datasets.measured.base import NOTHING, HearsSensors, Measurements
+from pliant.datasets.measured.found import hearing
 from pliant.datasets.rectifier import Rectifier, rectified
 from pliant.datasets.static_mask import static_counters
 from pliant.datasets.working_size import SmallerImages
@@ -43,7 +44,7 @@ from pliant.messages.types import (
     SourceImage,
 )
 from pliant.recording.map_file import MapFile
-from pliant.recording.measured import gps_pieces, imu_pieces
+from pliant.recording.measured import gps_pieces, imu_piece, imu_pieces
 from pliant_services.runtime.keeping_up import (
     Drops,
     MappingPace,
@@ -68,7 +69,8 @@ def run(
     known: a map of earlier sessions.   measured: what other sensors of the source measured.
     Raises SourceLostError if the source fails after its first frame; what came before is sent.
     """
-    live, heard = plays_live(dataset, config), heard_by(dataset)
+    live, hears = plays_live(dataset, config), hearing(dataset)
+    hears_imu = hears is not None and hears.has_imu
     rectifier = Rectifier(dataset.calibration)
     link = Sender(config.bus, dataset.calibration)
     clip = _clip(dataset, config)
@@ -76,13 +78,17 @@ def run(
 
     def start() -> tuple[Any, ...]:
         stream = _stream(dataset, rectifier, known, live=live)
-        bus.publish(topics.STREAM, replace(stream, sensors_last=heard is not None))
+        stream = replace(stream, sensors_last=hears is not None, imu_by_frame=hears_imu)
+        bus.publish(topics.STREAM, stream)
         bus.end(topics.STREAM)  # its readers wait for its end before the first frame
         for piece in clip.pieces() if clip is not None else ():
             bus.publish(topics.CLIP, piece)
         bus.end(topics.CLIP)
-        if heard is None:
-            _publish(bus, measured)
+        if hears is None:
+            for samples in imu_pieces(measured.imu):
+                bus.publish(topics.IMU, samples)
+            bus.end(topics.IMU)
+            _publish_fixes(bus, measured)
         for keyframe in known.keyframes() if known is not None else ():
             bus.publish(topics.MAP_KNOWN, keyframe)
         bus.end(topics.MAP_KNOWN)
@@ -113,6 +119,9 @@ def run(
                 clip = None  # the file now differs from what was sent
             bus.publish(topics.SOURCE, _source_message(source, image, clip is not None))
             may_lag = readers_that_may_lag(image)
+            if hears is not None and hears_imu:  # those so far: a replay has the same ones
+                piece = imu_piece(hears.next_imu(), image.frame)
+                bus.publish(topics.IMU, piece, may_lag=may_lag)
             bus.publish(topics.IMAGE, link.image(image, source), live=live, may_lag=may_lag)
             bus.publish(topics.DEPTH, _depth_message(source), may_lag=may_lag)
             counters = {"dropped": dropped, "broken": broken, **pace.counters}
@@ -126,26 +135,27 @@ def run(
             raise
         counters |= drops.counters
         monitor.report(image, note=str(error), **counters)
-        _publish_heard(bus, heard, complete=False)
+        _publish_heard(bus, hears, image.frame, complete=False)
         raise SourceLostError(str(error)) from None
-    _publish_heard(bus, heard, complete=True)
+    _publish_heard(bus, hears, -1 if image is None else image.frame, complete=True)
 
 
-def _publish(bus: Bus, measured: Measurements, *, complete: bool = True) -> None:
-    """All that other sensors measured."""
-    for samples in imu_pieces(measured.imu):
-        bus.publish(topics.IMU, samples)
-    bus.end(topics.IMU, complete=complete)
+def _publish_fixes(bus: Bus, measured: Measurements, *, complete: bool = True) -> None:
     for fixes in gps_pieces(measured.gps):
         bus.publish(topics.GPS, fixes)
     bus.end(topics.GPS, complete=complete)
 
 
-def _publish_heard(bus: Bus, heard: Callable[[], Measurements] | None, *, complete: bool) -> None:
-    """What other sensors of a live source have measured meanwhile."""
-    if heard is not None:
-        bus.end(topics.IMAGE, complete=complete)  # its readers read what follows once it has ended
-        _publish(bus, heard(), complete=complete)
+def _publish_heard(bus: Bus, hears: HearsSensors | None, last: int, *, complete: bool) -> None:
+    """What other sensors of a live source have measured since the last frame."""
+    if hears is None:
+        return
+    bus.end(topics.IMAGE, complete=complete)  # its readers read what follows once it has ended
+    while hears.has_imu and len((samples := hears.next_imu()).stamps_ns):
+        last += 1
+        bus.publish(topics.IMU, imu_piece(samples, last))
+    bus.end(topics.IMU, complete=complete)
+    _publish_fixes(bus, hears.heard(), complete=complete)
 
 
 def plays_live(dataset: Dataset, config: Config) -> bool:

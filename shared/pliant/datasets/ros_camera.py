@@ -13,11 +13,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from pliant.algorithms.inertial.samples import ImuSamples
 from pliant.bus.session import open_session
 from pliant.datasets.base import Dataset
 from pliant.datasets.image_messages import RecordedImage, capture_time, plain_type
 from pliant.datasets.measured.base import Measurements
-from pliant.datasets.measured.message_topics import sensor_topics, sensors_of
+from pliant.datasets.measured.message_topics import ImuStream, fixes_of, sensor_topics
 from pliant.datasets.message_files import MessageImages, MessageTopic, recorded_image
 from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import BusError, DatasetError
@@ -47,22 +48,25 @@ class RosCamera(MessageImages):
         super().__init__(graph, spec)
         self.name = spec.location
         self._spec, self._heard = spec, graph.heard
+        imu, fixes = list[MessageTopic](), list[MessageTopic]()
         with graph.open() as opened:
             try:
-                graph.heard.topics = [
-                    t for kind in sensor_topics(opened, spec, graph) for t in kind
-                ]
+                imu, fixes = sensor_topics(opened, spec, graph)
             except DatasetError as error:
                 if spec.imu or spec.gps:
                     raise
                 self.notes.append(str(error))
+        self._heard.topics, self._fixes = [*imu, *fixes], fixes
+        self.has_imu = bool(imu)
+        self._imu = ImuStream(self._heard, imu)
+
+    def next_imu(self) -> ImuSamples:
+        """Inertial samples since the last call, or since the first image; of a source with any."""
+        return self._imu.take()
 
     def heard(self) -> Measurements:
-        """Measurements of other sensors since the first image."""
-        try:
-            return sensors_of(self._heard, self._spec)
-        except DatasetError as error:
-            return Measurements(imu_notes=(str(error),))
+        """Satellite fixes since the first image."""
+        return fixes_of(self._heard, self._fixes, self._heard)
 
 
 class _Heard:
@@ -79,8 +83,11 @@ class _Heard:
         yield self
 
     def messages(self, topic: MessageTopic) -> Iterator[RecordedImage]:
-        """The messages of a topic so far."""
-        for arrived_ns, kind, data in list(self.came.get(topic.name, ())):
+        """The messages of a topic since the last call."""
+        came = self.came.get(topic.name, [])
+        new = came[:]
+        del came[: len(new)]  # meanwhile more may have come
+        for arrived_ns, kind, data in new:
             yield recorded_image(arrived_ns, partial(_decoded, kind), data)
 
 

@@ -43,7 +43,7 @@ class Topic:
     max_bytes: int = 16 * _MIB
     """A larger message is refused before memory is taken for it."""
     kept_whole: bool = False
-    """Its readers take in all of it before they come to a checkpoint, so that senders keep all."""
+    """Its readers may take in all of it before they come to a checkpoint, so senders keep all."""
     viewed: int = 0
     """Viewers draw it: this many of its newest messages are kept for a slow one."""
     compression: str = "zstd"
@@ -64,6 +64,7 @@ IMAGE = Topic(
 # Empty if only the recorder would read it.
 DEPTH = Topic("camera/depth", Depth, per_frame=True, max_bytes=128 * _MIB, compression="")
 # All that the source's other sensors measured, before the first frame: nothing if it has none.
+# Of a live source, samples come with the frames, and fixes after the last one.
 IMU = Topic("imu/samples", ImuPiece, per_frame=False, max_bytes=_MIB, kept_whole=True)
 GPS = Topic("gps/fixes", GpsPiece, per_frame=False, max_bytes=_MIB)
 # The map of earlier sessions, before the first frame: nothing if a run begins without one.

@@ -70,8 +70,8 @@ class CameraStream(Header):
     z_is_up: whether the z axis of the map points against gravity, as inertial samples measured it.
     focal_sigma: standard deviation of the log focal length where it is a guess; 0: calibrated.
     source_width, source_height: of the images before they were made smaller; 0: as they are.
-    sensors_last: whether what other sensors measured comes after the last frame, not before the
-    first.
+    sensors_last: whether what other sensors measured comes with the frames or after the last one,
+    not before the first.   imu_by_frame: whether a piece of inertial samples precedes each frame.
     """
 
     source: str
@@ -90,6 +90,7 @@ class CameraStream(Header):
     source_height: int = 0
     z_is_up: bool = False
     sensors_last: bool = False
+    imu_by_frame: bool = False
 
     @property
     def camera(self) -> PinholeCamera:
@@ -157,7 +158,8 @@ class Depth(Header):
 
 @dataclass(frozen=True, kw_only=True)
 class ImuPiece(Header, ImuSamples):
-    """The next inertial samples of the source.  frame: number of this piece, from 0.
+    """The next inertial samples of the source.  frame: number of this piece, from 0; of a live
+    source the number of the frame that it precedes.
 
     stamp_ns: 0; samples may be older than the first image.
     """

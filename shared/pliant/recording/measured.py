@@ -1,12 +1,9 @@
 """Inertial samples and satellite fixes as messages, and back from a recording."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import fields
 from typing import Any
 
-import numpy as np
-
-from pliant.algorithms.inertial.samples import GpsFixes, ImuSamples
+from pliant.algorithms.inertial.samples import GpsFixes, ImuSamples, joined
 from pliant.messages import topics
 from pliant.messages.types import GPS_FRAME_ID, IMU_FRAME_ID, GpsPiece, Header, ImuPiece
 from pliant.recording.reader import Recording
@@ -18,14 +15,14 @@ _PIECE = 4096
 def imu_pieces(samples: ImuSamples) -> Iterator[ImuPiece]:
     """The samples as messages, in order; none without samples."""
     for number, rows in _parts(len(samples.stamps_ns)):
-        yield ImuPiece(
-            frame=number,
-            stamp_ns=0,
-            frame_id=IMU_FRAME_ID,
-            stamps_ns=samples.stamps_ns[rows],
-            gyro_rad_s=samples.gyro_rad_s[rows],
-            accel_m_s2=samples.accel_m_s2[rows],
-        )
+        part = {name: values[rows] for name, values in vars(samples).items()}
+        yield imu_piece(ImuSamples(**part), number)
+
+
+def imu_piece(samples: ImuSamples, number: int) -> ImuPiece:
+    """The samples as one message."""
+    header = Header(frame=number, stamp_ns=0, frame_id=IMU_FRAME_ID)
+    return ImuPiece.of(header, samples)
 
 
 def gps_pieces(fixes: GpsFixes) -> Iterator[GpsPiece]:
@@ -53,7 +50,9 @@ def imu_of(recording: Recording) -> ImuSamples:
 
 def imu_in(pieces: Iterable[Header]) -> ImuSamples:
     """The samples of ``imu_pieces``."""
-    return ImuSamples(**_joined(pieces, ImuSamples.empty()))
+    each: list[Any] = [ImuSamples.empty(), *pieces]
+    found: ImuSamples = joined(each)
+    return found
 
 
 def fixes_of(recording: Recording) -> GpsFixes:
@@ -61,18 +60,11 @@ def fixes_of(recording: Recording) -> GpsFixes:
 
     Raises MessageError.
     """
-    return GpsFixes(**_joined(recording.decoded(topics.GPS), GpsFixes.empty()))
+    each: list[Any] = [GpsFixes.empty(), *recording.decoded(topics.GPS)]
+    found: GpsFixes = joined(each)
+    return found
 
 
 def _parts(count: int) -> Iterator[tuple[int, slice]]:
     for number, start in enumerate(range(0, count, _PIECE)):
         yield number, slice(start, min(count, start + _PIECE))
-
-
-def _joined(pieces: Iterable[Header], empty: ImuSamples | GpsFixes) -> dict[str, Any]:
-    """Every array of pieces, end to end."""
-    each = [empty, *pieces]
-    return {
-        field.name: np.concatenate([getattr(piece, field.name) for piece in each])
-        for field in fields(empty)
-    }

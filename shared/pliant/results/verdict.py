@@ -135,6 +135,9 @@ def _gyro_lines(report: dict[str, Any]) -> list[str]:
             f"{counted(len(carried), 'frame')} without a pose by images, placed by the gyro "
             f"between others: {', '.join(named[:_NAMED])}{more}"
         )
+    if late := int(counters.get("gyro_late", 0)):
+        had = "samples of their time had not come"
+        lines.append(f"{counted(late, 'frame')} without a prediction by the gyro: {had}")
     if counters.get("gyro_dropped"):
         used = counted(int(counters.get("gyro_frames", 0)), "frame")
         lines.append(f"gyro not used after {used} with it: it contradicts the images")

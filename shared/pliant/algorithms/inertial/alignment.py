@@ -7,7 +7,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.inertial.estimator import NOISE_RANGE, Estimate, estimate
-from pliant.algorithms.inertial.preintegration import ImuSignal, NoiseDensity
+from pliant.algorithms.inertial.preintegration import GyroSignal, ImuSignal, NoiseDensity
 from pliant.algorithms.inertial.residuals import GRAVITY, GRAVITY_M_S2, OFFSET, TURN, Nodes, State
 from pliant.algorithms.inertial.rotation_alignment import (
     RotationAlignment,
@@ -142,17 +142,22 @@ def noise_densities(signal: ImuSignal) -> NoiseDensity:
 
     The median of their squares is that of noise even where shocks are in between.
     """
-    root = float(np.sqrt(np.median(np.diff(signal.times_s))))
-
-    def density(values: F64) -> float:
-        third = np.diff(values, n=3, axis=0)
-        # 1, 3, 3 and 1 times the noise; 0.455 is the median of a squared normal variable.
-        return float(np.sqrt(np.median(third**2) / (20.0 * 0.455))) * root
-
     return NoiseDensity(
-        gyro=max(density(signal.gyro), _LEAST_DENSITY.gyro),
-        accel=max(density(signal.accel), _LEAST_DENSITY.accel),
+        gyro=gyro_noise_density(signal),
+        accel=max(_noise_density(signal.times_s, signal.accel), _LEAST_DENSITY.accel),
     )
+
+
+def gyro_noise_density(signal: GyroSignal) -> float:
+    """That of the gyro alone, rad/s/sqrt(Hz)."""
+    return max(_noise_density(signal.times_s, signal.gyro), _LEAST_DENSITY.gyro)
+
+
+def _noise_density(times_s: F64, values: F64) -> float:
+    root = float(np.sqrt(np.median(np.diff(times_s))))
+    third = np.diff(values, n=3, axis=0)
+    # 1, 3, 3 and 1 times the noise; 0.455 is the median of a squared normal variable.
+    return float(np.sqrt(np.median(third**2) / (20.0 * 0.455))) * root
 
 
 def rotation_fault(rotation: RotationAlignment | None) -> str:

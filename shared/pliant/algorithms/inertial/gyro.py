@@ -15,18 +15,25 @@ C G C^T of the camera.  With the right errors of G that ``preintegration`` deriv
 
     e = C (d G / d b) d b + C (d G / d o) d o + (C G^T C^T - I) c.
 
+Samples of a live source arrive in parallel with its frames.  Those that are too late for the pose
+of a frame still count for the alignment, and for the judgement of the gyro.
+
 Where the camera was lost since, the solution begins with few turns.  What the earlier ones have
 shown is then its prior: the estimate before the loss, with P and what the bias has walked since.
 """
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import hat, so3_exp, so3_log
-from pliant.algorithms.inertial.alignment import averaged_signal, noise_densities, rotation_fault
+from pliant.algorithms.inertial.alignment import (
+    averaged_signal,
+    gyro_noise_density,
+    rotation_fault,
+)
 from pliant.algorithms.inertial.preintegration import GyroSignal, right_jacobian
 from pliant.algorithms.inertial.rotation_alignment import (
     AVERAGED_S,
@@ -37,7 +44,7 @@ from pliant.algorithms.inertial.rotation_alignment import (
     gyro_rates,
     longest_gap_s,
 )
-from pliant.algorithms.inertial.samples import ImuSamples
+from pliant.algorithms.inertial.samples import ImuSamples, append, joined
 
 _FIRST_S, _LATER = 3.5, 1.5
 """Seconds of poses after which the gyro is aligned, and by which factor more from then on."""
@@ -63,7 +70,7 @@ _WALK = 3e-5
 """Of the bias, rad/s^2/sqrt(Hz): of a sensor of middle quality."""
 _CLOCKS = 2e-5
 """Two clocks differ by this share."""
-_NO_SAMPLES = np.zeros(2), np.zeros((2, 3))
+_NO_SAMPLES = GyroSignal(times_s=np.zeros(2), gyro=np.zeros((2, 3)))
 _APART = 0.3
 """Two turns that differ by more, as a share, contradict each other: less than 90 % of its square
 is explained."""
@@ -104,9 +111,11 @@ class Gyro:
     is_believed: from some time on.   dropped: since then, as it contradicts the images.
     given_up: never believed, and never will be.
     frames: that were placed with its help.   carried: frames that were placed by it alone.
+    late: frames that were located without it, as the samples did not reach their time.
+    blocks: the samples so far.
     """
 
-    signal: GyroSignal
+    blocks: list[GyroSignal]
     origin_ns: int
     gap_s: float
     density: float
@@ -115,6 +124,7 @@ class Gyro:
     is_believed: bool = False
     frames: int = 0
     carried: int = 0
+    late: int = 0
     _aligned: _Aligned | None = None
     _earlier: _Aligned | None = None  # before the camera was lost
     _unexplained_s: float = 0.0
@@ -123,6 +133,9 @@ class Gyro:
     _times_s: list[float] = field(default_factory=list[float])
     _turns: list[F64] = field(default_factory=list[F64])
     _interval: tuple[int, F64, float] | None = None
+    _unjudged: list[tuple[int, int, F64, float]] = field(
+        default_factory=list[tuple[int, int, F64, float]]
+    )
     _agreed: list[bool] = field(default_factory=list[bool])
 
     @staticmethod
@@ -134,15 +147,30 @@ class Gyro:
         signal = averaged_signal(samples, origin_ns)
         if len(signal.times_s) < 5:
             return None
-        density = noise_densities(signal).gyro
-        gap_s = longest_gap_s(signal)
         rates = GyroSignal(times_s=signal.times_s, gyro=signal.gyro)
-        return Gyro(signal=rates, origin_ns=origin_ns, gap_s=gap_s, density=density)
+        gap_s, density = longest_gap_s(rates), gyro_noise_density(rates)
+        return Gyro(blocks=[rates], origin_ns=origin_ns, gap_s=gap_s, density=density)
+
+    def add_samples(self, samples: ImuSamples) -> None:
+        """Take in the next samples."""
+        if self.is_over:
+            return
+        times_s = np.float64(1e-9) * (samples.stamps_ns - self.origin_ns)
+        append(self.blocks, GyroSignal(times_s=times_s, gyro=samples.gyro_rad_s))
+        if len(self.blocks) == 1:
+            self.gap_s = longest_gap_s(self.blocks[0])
+            self.density = gyro_noise_density(self.blocks[0])
+
+    @property
+    def signal(self) -> GyroSignal:
+        """All samples so far."""
+        return joined(self.blocks)
 
     @property
     def counters(self) -> dict[str, int]:
         """Counts for the summary of a run."""
-        counts = {"frames": self.frames, "carried": self.carried, "dropped": int(self.dropped)}
+        counts = {"frames": self.frames, "carried": self.carried, "late": self.late}
+        counts["dropped"] = int(self.dropped)
         return {f"gyro_{name}": count for name, count in counts.items()}
 
     @property
@@ -157,6 +185,13 @@ class Gyro:
             return None
         return self._turned(aligned, first_ns, second_ns)
 
+    def predict(self, first_ns: int, second_ns: int) -> GyroTurn | None:
+        """The camera's turn to a frame whose pose is to be found."""
+        turn = self.turn(first_ns, second_ns)
+        is_used = self.is_believed and not self.dropped
+        self.late += is_used and turn is None and not self._reaches(second_ns)
+        return turn
+
     def see(
         self,
         first_ns: int,
@@ -170,7 +205,6 @@ class Gyro:
         """
         if self.is_over:
             return
-        self.frames += self.is_believed
         first_s, second_s = self._seconds(first_ns), self._seconds(second_ns)
         if not self._times_s or self._times_s[-1] != first_s:
             self.lose()
@@ -208,27 +242,39 @@ class Gyro:
 
     def _leave(self) -> None:
         """Discard what is no longer used."""
-        self.signal = GyroSignal(times_s=_NO_SAMPLES[0], gyro=_NO_SAMPLES[1])
+        self.blocks, self._unjudged = [_NO_SAMPLES], []
         self._times_s, self._turns, self._interval = [], [], None
         self._aligned = self._earlier = None
 
     def _judge(
         self, first_ns: int, second_ns: int, R_first_second: F64, variances: tuple[float, float]
     ) -> None:
-        """Compare an interval of frames with the gyro.  The rotations between its ends cancel."""
+        """Compare intervals of frames with the gyro, once samples reach their end.  The rotations
+        between the ends of an interval cancel.
+        """
         start_ns, R_before, at_start = self._interval or (first_ns, np.eye(3), variances[0])
         R = R_before @ R_first_second
         self._interval = (start_ns, R, at_start)
         if (second_ns - start_ns) * 1e-9 < AVERAGED_S or self._aligned is None:
             return
         self._interval = None
-        told = self._turned(self._aligned, start_ns, second_ns)
+        self._unjudged = [*self._unjudged, (start_ns, second_ns, R, at_start + variances[1])][-_OF:]
+        self._judge_waiting()
+
+    def _judge_waiting(self) -> None:
+        while self._unjudged and self._aligned and self._reaches(self._unjudged[0][1]):
+            self._compare(self._aligned, *self._unjudged.pop(0))
+
+    def _compare(
+        self, aligned: _Aligned, start_ns: int, second_ns: int, R: F64, variance: float
+    ) -> None:
+        """Judge the gyro by the turn R (3, 3) of the images, and the variance of its ends."""
+        told = self._turned(aligned, start_ns, second_ns)
         if told is None:
             return
         allowed = _APART * float(max(np.linalg.norm(so3_log(R)), np.linalg.norm(so3_log(told.R))))
         apart = float(np.linalg.norm(so3_log(told.R.T @ R)))
-        variance = at_start + variances[1] + self._aligned.noise**2
-        variance += float(np.linalg.norm(told.covariance, 2))
+        variance += aligned.noise**2 + float(np.linalg.norm(told.covariance, 2))
         unsure = _SIGMAS * float(np.sqrt(variance))
         if apart > allowed + unsure:
             self._agreed.append(False)
@@ -239,7 +285,7 @@ class Gyro:
         if not self.is_believed and agreed >= _PROOFS:
             self.is_believed = True
         elif len(self._agreed) - agreed >= _PROOFS:
-            self._agreed = []
+            self._agreed, self._unjudged = [], []
             if self.is_believed:
                 self.dropped = True
                 self._leave()
@@ -257,10 +303,20 @@ class Gyro:
         found = _refined(start, prior, times_s, turns, self.signal, self.gap_s)
         self._aligned = found or self._aligned
 
+    def _reaches(self, stamp_ns: int) -> bool:
+        """Whether the samples so far reach the time of a frame."""
+        offset_s = 0.0 if self._aligned is None else self._aligned.offset_s
+        return self._seconds(stamp_ns) + offset_s <= float(self.blocks[-1].times_s[-1])
+
+    def _between(self, start_s: float, end_s: float) -> GyroSignal:
+        first = bisect_right(self.blocks, start_s, key=lambda block: block.times_s[0]) - 1
+        last = bisect_left(self.blocks, end_s, key=lambda block: block.times_s[-1]) + 1
+        return joined(self.blocks[max(first, 0) : last]).between(start_s, end_s)
+
     def _turned(self, aligned: _Aligned, first_ns: int, second_ns: int) -> GyroTurn | None:
         a = self._seconds(first_ns) + aligned.offset_s
         b = self._seconds(second_ns) + aligned.offset_s
-        signal = self.signal.between(a, b)
+        signal = self._between(a, b)
         if b <= a or not signal.covers(np.array([a]), np.array([b]), self.gap_s)[0]:
             return None
         G, by_bias, by_offset = integrated(signal, a, b, aligned.bias)

@@ -1,11 +1,17 @@
-"""Measurements of an inertial sensor and of a satellite receiver."""
+"""Measurements of an inertial sensor and of a satellite receiver, and blocks of them."""
 
-from dataclasses import dataclass
-from typing import Annotated
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64, Shape
+
+BLOCK_BYTES = 1 << 18
+"""A block of measurements as large as this never changes: see ``append``."""
+
+_R = TypeVar("_R")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,3 +68,26 @@ class GpsFixes:
             altitude_m=none,
             sigma_m=np.empty((0, 3)),
         )
+
+
+def bytes_of(record: Any) -> int:
+    """Bytes of the arrays of a record."""
+    return sum(int(values.nbytes) for values in vars(record).values())
+
+
+def joined(records: Sequence[_R]) -> _R:
+    """One record with every array of records, of which all are arrays, end to end."""
+    if len(records) == 1:
+        return records[0]
+    first: Any = records[0]
+    names = [each.name for each in fields(first)]
+    arrays = {name: np.concatenate([getattr(r, name) for r in records]) for name in names}
+    made: _R = type(first)(**arrays)
+    return made
+
+
+def append(blocks: list[_R], more: _R) -> None:
+    """Add a record of arrays to the last of the blocks, or as a new one if that is full."""
+    if blocks and bytes_of(blocks[-1]) < BLOCK_BYTES:
+        more = joined([blocks.pop(), more])
+    blocks.append(more)

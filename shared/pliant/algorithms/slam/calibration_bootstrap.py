@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.inertial.samples import ImuSamples
+from pliant.algorithms.inertial.samples import ImuSamples, append
 from pliant.algorithms.map_delta import TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment
 from pliant.algorithms.slam.calibration.self_calibration import is_guess, widened
@@ -56,14 +56,20 @@ class BootstrapMapper:
         parameters: MappingParameters,
         seed: int,
         known: Sequence[KeptKeyframe] = (),
-        samples: ImuSamples | None = None,
     ) -> None:
-        """known, samples: as of ``Mapper``; the trial ignores them."""
+        """known: as of ``Mapper``; the trial ignores it."""
         self._given = (camera, parameters, seed)
-        self._known, self._samples = list(known), samples
+        self._known, self._samples = list(known), list[ImuSamples]()
         self._mapper = Mapper(camera, parameters, seed)
         self._taken: list[_Taken] = []
         self._on_trial = True
+
+    def add_samples(self, samples: ImuSamples) -> None:
+        """As ``Mapper.add_samples``; the trial ignores them."""
+        if self._on_trial:
+            append(self._samples, samples)
+        else:
+            self._mapper.add_samples(samples)
 
     def process(self, frame: Frame, timer: StageTimer = no_stages) -> MapDelta:
         """As ``Mapper.process``."""
@@ -116,11 +122,11 @@ class BootstrapMapper:
         """As ``Mapper.counters``."""
         return {} if self._on_trial else self._mapper.counters
 
-    def finish(self, timer: StageTimer = no_stages, samples: ImuSamples | None = None) -> MapDelta:
+    def finish(self, timer: StageTimer = no_stages) -> MapDelta:
         """As ``Mapper.finish``; a trial still running ends first."""
         if self._on_trial and (self._first is not None or self._mapper.start_at_last()):
             self._map_all_taken(no_stages)
-        return self._mapper.finish(timer, samples)
+        return self._mapper.finish(timer)
 
     def kept(self) -> Iterator[KeptKeyframe]:
         """As ``Mapper.kept``; the loaded map if the trial found none."""
@@ -139,11 +145,11 @@ class BootstrapMapper:
 
     def _map_all_taken(self, timer: StageTimer) -> Outcome:
         """Map all waiting frames with the estimated camera.  Returns the newest outcome."""
-        self._mapper = Mapper(
-            *self._given, self._mapper.calibration, known=self._known, samples=self._samples
-        )
-        self._samples = None
+        self._mapper = Mapper(*self._given, self._mapper.calibration, known=self._known)
         self._on_trial = False
+        for samples in self._samples:
+            self.add_samples(samples)
+        self._samples = []
         taken, self._taken = self._taken, []
         return [self._map_again(each, timer) for each in taken][-1]
 
@@ -162,20 +168,18 @@ def mapper_for(
     seed: int,
     focal_sigma: float = 0.0,
     known: Sequence[KeptKeyframe] = (),
-    samples: ImuSamples | None = None,
 ) -> FrameMapper:
     """Return the mapper for a camera, depending on how certain its calibration is: see ``widened``.
 
     known: a loaded map; if it is of the same camera, its calibration is used.
-    samples: inertial, of the whole source.
     """
     parameters = widened(parameters, focal_sigma)
     if parameters.only_localise:
         return Localiser(camera, parameters, seed, known=known)
     found = known_camera(known, camera)
     if is_guess(parameters.calibration) and (found is None or found.sigmas[0] > _KNOWN):
-        return BootstrapMapper(camera, parameters, seed, known, samples)
-    return Mapper(camera, parameters, seed, known=known, samples=samples)
+        return BootstrapMapper(camera, parameters, seed, known)
+    return Mapper(camera, parameters, seed, known=known)
 
 
 def _nothing(reason: str) -> MapDelta:

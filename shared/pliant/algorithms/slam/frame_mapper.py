@@ -18,6 +18,12 @@ class FrameMapper(Protocol):
     object is its state: a checkpoint stores it.
     """
 
+    def add_samples(self, samples: ImuSamples) -> None:
+        """Take in the next inertial samples of the source, if it has any, before the frame that
+        they precede.
+        """
+        ...
+
     def process(self, frame: Frame, timer: StageTimer = no_stages) -> MapDelta:
         """Localise a frame, extend the map, and return what readers need."""
         ...
@@ -33,11 +39,8 @@ class FrameMapper(Protocol):
         """Skip a frame without pixels or without time: it gets no pose."""
         ...
 
-    def finish(self, timer: StageTimer = no_stages, samples: ImuSamples | None = None) -> MapDelta:
-        """Return the last corrections, after the last frame.
-
-        samples: inertial, of the whole source, that came meanwhile.
-        """
+    def finish(self, timer: StageTimer = no_stages) -> MapDelta:
+        """Return the last corrections, after the last frame."""
         ...
 
     def publish_keyframes(self) -> KeyframeDelta:

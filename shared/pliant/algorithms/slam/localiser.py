@@ -137,8 +137,11 @@ class Localiser(FrameMapper):
         """Number of landmarks in the map."""
         return int(np.count_nonzero(self._points.state == MAPPED))
 
-    def finish(self, timer: StageTimer = no_stages, samples: ImuSamples | None = None) -> MapDelta:
-        """As ``Mapper.finish``; samples do not change a loaded map."""
+    def add_samples(self, samples: ImuSamples) -> None:
+        """As ``Mapper.add_samples``; they do not change a loaded map."""
+
+    def finish(self, timer: StageTimer = no_stages) -> MapDelta:
+        """As ``Mapper.finish``."""
         return self._publish(WAITING if self._map is None else TRACKING, "", 0)
 
     def publish_keyframes(self) -> KeyframeDelta:

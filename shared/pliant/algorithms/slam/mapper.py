@@ -13,7 +13,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.image.exposure import flaw_of
-from pliant.algorithms.inertial.samples import ImuSamples
+from pliant.algorithms.inertial.samples import ImuSamples, append, joined
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.slam.active.active_map import ActiveMap
 from pliant.algorithms.slam.active.frame_pose import (
@@ -66,10 +66,9 @@ class Mapper:
         seed: int,
         calibration: SelfCalibration | None = None,
         known: Sequence[KeptKeyframe] = (),
-        samples: ImuSamples | None = None,
     ) -> None:
         """calibration: estimated so far; None: that of the map, or of the parameters.   known: a
-        loaded map in which the camera may be recognised.   samples: inertial, of the whole source.
+        loaded map in which the camera may be recognised.
         """
         calibration = (
             calibration
@@ -85,13 +84,19 @@ class Mapper:
         self._parameters = parameters
         self._generator = np.random.default_rng(seed)
         self._motion = Motion.at(0, 0, np.eye(4))  # in the active segment
-        self._turns = FrameTurns.of(samples)
-        self._samples = samples
+        self._turns = FrameTurns()
+        self._samples: list[ImuSamples] = []
         self._couplings: list[Coupling] = []
         self._lost_frames = 0
         self._keyframe_ns = 0
         self._keyframe_is_new = False
         self._recognised: int | None = None  # the keyframe, until this frame becomes one
+
+    def add_samples(self, samples: ImuSamples) -> None:
+        """Take in the next inertial samples of the source."""
+        if len(samples.stamps_ns):
+            append(self._samples, samples)
+            self._turns.add_samples(samples, self._samples)
 
     def process(self, frame: Frame, timer: StageTimer = no_stages) -> MapDelta:
         """Localise a frame, extend the map, and return what readers need."""
@@ -148,24 +153,16 @@ class Mapper:
         """
         return self.publish(self._skipped(reason))
 
-    def finish(
-        self,
-        timer: StageTimer = no_stages,
-        samples: ImuSamples | None = None,
-        placed: PlacedFrames | None = None,
-    ) -> MapDelta:
+    def finish(self, timer: StageTimer = no_stages, placed: PlacedFrames | None = None) -> MapDelta:
         """Apply the remaining corrections at the end of the stream.
 
-        samples: inertial, that came too late for ``__init__``.   placed: frames that they are
-        compared with; None: those of this mapper.
+        placed: frames that inertial samples are compared with; None: those of this mapper.
         """
         self.start_at_last()
-        samples, stamps_ns = samples or self._samples, self._poses.stamps_ns
-        self._couplings = []
-        inertial = (
-            None if samples is None or not len(samples.stamps_ns)
-            else InertialSource(samples, stamps_ns, self._couplings, placed)
-        )  # fmt: skip
+        self._couplings, inertial = [], None
+        if self._samples:
+            samples, stamps_ns = joined(self._samples), self._poses.stamps_ns
+            inertial = InertialSource(samples, stamps_ns, self._couplings, placed)
         self.follow(self.atlas.finish(timer, inertial))
         with timer("skipped frames"):
             for segment, seen_by in self.atlas.everything():

@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I64
+from pliant.algorithms.arrays import F64, I64, BoolArray
 from pliant.algorithms.inertial.samples import GpsFixes, ImuSamples
 from pliant.datasets.frame_times import increasing
 from pliant.wording import counted
@@ -70,10 +70,22 @@ NOTHING = Measurements()
 
 @runtime_checkable
 class HearsSensors(Protocol):
-    """A live source that hears other sensors while its images come."""
+    """A live source that hears other sensors while its images come.
+
+    has_imu: whether inertial samples are among what it may hear.
+    """
+
+    has_imu: bool
+
+    def next_imu(self) -> ImuSamples:
+        """The inertial samples since the last call, on the clock of the images.
+
+        They are at most as many as a message has; the next call has the rest.
+        """
+        ...
 
     def heard(self) -> Measurements:
-        """What they have measured so far, on the clock of the images."""
+        """All other measurements so far, on the clock of the images."""
         ...
 
 
@@ -88,6 +100,19 @@ class Series:
     def of(stamps_ns: Sequence[int], values: Sequence[Sequence[float]], width: int = 3) -> "Series":
         """From lists."""
         return Series(np.array(stamps_ns, np.int64), np.array(values, float).reshape(-1, width))
+
+    def and_then(self, later: "Series") -> "Series":
+        """These, and then others."""
+        stamps_ns = np.concatenate([self.stamps_ns, later.stamps_ns])
+        return Series(stamps_ns, np.concatenate([self.values, later.values]))
+
+    def columns(self, first: int, end: int) -> "Series":
+        """Some of the values."""
+        return Series(self.stamps_ns, self.values[:, first:end])
+
+    def rows(self, chosen: BoolArray) -> "Series":
+        """Some of the samples."""
+        return Series(self.stamps_ns[chosen], self.values[chosen])
 
     def in_order(self, *, needed: int | None = None) -> "Series":
         """Those whose time increases, and whose first ``needed`` values (None: all) are numbers."""

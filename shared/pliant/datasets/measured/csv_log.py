@@ -177,11 +177,9 @@ def in_m_s2(accel: F64, factor: float | None, where: Path | str) -> tuple[F64, s
     At rest an accelerometer measures gravity, and a camera that is held by hand, by a car or by a
     drone accelerates less than that most of the time.  Raises DatasetError if it is missing.
     """
-    lengths = np.linalg.norm(accel[np.isfinite(accel).all(axis=1)], axis=1)
-    median = float(np.median(lengths)) if len(lengths) else 0.0
-    note = ""
+    median, note = _median_length(accel), ""
     if factor is None:
-        factor = STANDARD_GRAVITY_M_S2 if 0.5 <= median <= 2.0 else 1.0
+        factor = likely_factor(accel)
         note = f"{where}: accelerations are taken as g, not m/s^2" if factor != 1.0 else ""
     if median * abs(factor) < 0.5 * STANDARD_GRAVITY_M_S2:
         raise DatasetError(
@@ -189,6 +187,16 @@ def in_m_s2(accel: F64, factor: float | None, where: Path | str) -> tuple[F64, s
             "m/s^2), which the estimate of the scale needs: record the raw accelerometer"
         )
     return accel * factor, note
+
+
+def likely_factor(accel: F64) -> float:
+    """By what accelerations (N, 3) of an unknown unit are multiplied to be in m/s^2."""
+    return STANDARD_GRAVITY_M_S2 if 0.5 <= _median_length(accel) <= 2.0 else 1.0
+
+
+def _median_length(accel: F64) -> float:
+    lengths = np.linalg.norm(accel[np.isfinite(accel).all(axis=1)], axis=1)
+    return float(np.median(lengths)) if len(lengths) else 0.0
 
 
 def _columns(header: Sequence[str], file: Path) -> _Columns:

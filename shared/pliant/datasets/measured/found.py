@@ -1,6 +1,5 @@
 """Samples of other sensors of a source: from files that are named, or that come with it."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 from pliant.algorithms.arrays import I64
@@ -31,7 +30,7 @@ def measurements_of(spec: SourceSpec, dataset: Dataset) -> Measurements:
     files = {key: name for key, name in named.items() if name and not topics[key]}
     if files and dataset.is_live:
         raise DatasetError(f"{spec.location}: is live: leave out --imu and --gps")
-    if heard_by(dataset) is not None:
+    if hearing(dataset) is not None:
         return Measurements()
     found = Measurements()
     try:
@@ -54,11 +53,10 @@ def measurements_of(spec: SourceSpec, dataset: Dataset) -> Measurements:
     return _on_clock(found.without_gps(), found.imu.stamps_ns, dataset).and_those_of(gps)
 
 
-def heard_by(dataset: Dataset) -> Callable[[], Measurements] | None:
-    """Tells what other sensors have measured so far, of a source that hears them while its images
-    come; None of another one."""
+def hearing(dataset: Dataset) -> HearsSensors | None:
+    """The source, if it hears other sensors while its images come."""
     origin = _origin_of(dataset)
-    return origin.heard if isinstance(origin, HearsSensors) else None
+    return origin if isinstance(origin, HearsSensors) else None
 
 
 def _origin_of(dataset: Dataset) -> Dataset:

@@ -7,10 +7,12 @@ Times are those of the headers, as of the images.
 import re
 from array import array
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from pliant.algorithms.inertial.samples import ImuSamples
 from pliant.datasets.image_messages import FOREIGN, capture_time
 from pliant.datasets.measured.base import (
     Measurements,
@@ -18,7 +20,7 @@ from pliant.datasets.measured.base import (
     gps_measurements,
     imu_measurements,
 )
-from pliant.datasets.measured.csv_log import in_m_s2
+from pliant.datasets.measured.csv_log import in_m_s2, likely_factor
 from pliant.datasets.message_files import MessageFile, MessageTopic, OpenMessages
 from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError
@@ -26,6 +28,52 @@ from pliant.errors import DatasetError
 IMU_TYPES = ("sensor_msgs/Imu",)
 FIX_TYPES = ("sensor_msgs/NavSatFix", "foxglove/LocationFix")
 _NO_FIX = -1
+_ENOUGH = 20
+"""Accelerations that show their unit."""
+_AT_ONCE = 4096
+"""Samples of a piece: 56 bytes each."""
+_GAP_NS = 10**9
+"""The time of a sample that is so far ahead may be wrong: it counts with the next one."""
+
+
+@dataclass
+class ImuStream:
+    """Samples of topics that are published now, a piece at a time.
+
+    Each is given once an acceleration of its time, or a later one, has come.
+    """
+
+    file: MessageFile
+    topics: Sequence[MessageTopic]
+    _gyro: Series = field(default_factory=lambda: Series.of([], []))
+    _accel: Series = field(default_factory=lambda: Series.of([], []))
+    _factor: float | None = None
+    _last_ns: int = -1
+
+    def take(self) -> ImuSamples:
+        """The next samples."""
+        with self.file.open() as opened:
+            each = [_read(opened, topic, _gyro_and_accel, 6)[0] for topic in self.topics]
+        gyro = self._gyro.and_then(each[0].columns(0, 3))
+        self._gyro = gyro.rows(gyro.stamps_ns > self._last_ns)
+        self._accel = self._accel.and_then(each[-1].columns(3, 6))
+        gyro, accel = self._gyro.in_order(), self._accel.in_order()
+        if self._factor is None and len(accel) >= _ENOUGH:
+            self._factor = likely_factor(accel.values)
+        if self._factor is None or not len(gyro):
+            return ImuSamples.empty()
+        before_ns = gyro.stamps_ns[-2] if len(gyro) > 1 else self._last_ns
+        if gyro.stamps_ns[-1] - before_ns > _GAP_NS:
+            return ImuSamples.empty()
+        ready = gyro.stamps_ns <= accel.stamps_ns[-1]
+        ready[_AT_ONCE:] = False
+        used = np.searchsorted(accel.stamps_ns, gyro.stamps_ns[ready][-1:]).sum()
+        scaled = Series(accel.stamps_ns, self._factor * accel.values)
+        found = imu_measurements(gyro.rows(ready), scaled, "").imu
+        self._gyro = gyro.rows(~ready)
+        self._accel = accel.rows(np.arange(len(accel)) >= used - _ENOUGH)
+        self._last_ns = int(found.stamps_ns[-1]) if len(found.stamps_ns) else self._last_ns
+        return found
 
 
 def sensors_of(file: MessageFile, spec: SourceSpec) -> Measurements:
@@ -38,10 +86,18 @@ def sensors_of(file: MessageFile, spec: SourceSpec) -> Measurements:
         found = Measurements()
         if imu:
             found = found.and_those_of(_imu(opened, imu, file))
-        if len(fixes) == 1:
-            series, unreadable = _read(opened, fixes[0], _fix, 6)
-            where = f"{file.path.name}: {fixes[0].name}"
-            found = found.and_those_of(gps_measurements(series, where, unreadable=unreadable))
+        return found.and_those_of(fixes_of(opened, fixes, file))
+
+
+def fixes_of(
+    opened: OpenMessages, topics: Sequence[MessageTopic], file: MessageFile
+) -> Measurements:
+    """Satellite fixes of a topic; nothing without one."""
+    found = Measurements()
+    for topic in topics:
+        series, unreadable = _read(opened, topic, _fix, 6)
+        where = f"{file.path.name}: {topic.name}"
+        found = found.and_those_of(gps_measurements(series, where, unreadable=unreadable))
     return found
 
 

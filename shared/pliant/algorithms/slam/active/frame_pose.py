@@ -242,7 +242,7 @@ def rotation_by_image(active: ActiveMap, placed: PlacedFrame) -> tuple[F64, floa
     H = found.information
     # Without any points nothing is known: the inverse is as large as numbers allow.
     covariance = np.linalg.inv(H + np.diag(_REGULAR * np.diag(H) + _REGULAR))
-    return found.T_world_camera[:3, :3], float(np.linalg.norm(covariance[3:, 3:], 2))
+    return found.T_world_camera[:3, :3].copy(), float(np.linalg.norm(covariance[3:, 3:], 2))
 
 
 def adjust(active: ActiveMap, motion: Motion, placed: PlacedFrame) -> PlacedFrame:

@@ -1,12 +1,13 @@
 """How a camera turns between frames: by the gyro for the pose solver, by images for the gyro."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.inertial.gyro import Gyro
-from pliant.algorithms.inertial.samples import ImuSamples
+from pliant.algorithms.inertial.samples import ImuSamples, joined
 from pliant.algorithms.slam.active.active_map import ActiveMap
 from pliant.algorithms.slam.active.frame_pose import rotation_by_image
 from pliant.algorithms.slam.frame import PlacedFrame
@@ -34,15 +35,17 @@ class FrameTurns:
     here: the image of the current frame, in the current world.
     """
 
-    gyro: Gyro | None
+    gyro: Gyro | None = None
     last: ByImage | None = None
     R_last: F64 = field(default_factory=lambda: np.eye(3))
     here: ByImage | None = None
 
-    @staticmethod
-    def of(samples: ImuSamples | None) -> "FrameTurns":
-        """None: without a gyro."""
-        return FrameTurns(None if samples is None else Gyro.of(samples))
+    def add_samples(self, more: ImuSamples, so_far: Sequence[ImuSamples]) -> None:
+        """Take in the next samples.   so_far: blocks of all, these included."""
+        if self.gyro is None:
+            self.gyro = Gyro.of(joined(so_far))
+        else:
+            self.gyro.add_samples(more)
 
     @property
     def counters(self) -> dict[str, int]:
@@ -53,7 +56,7 @@ class FrameTurns:
         """Return the motion with the gyro's turn from the last pose to a frame."""
         if self.gyro is None:
             return motion
-        return replace(motion, turn=self.gyro.turn(motion.stamps_ns[1], stamp_ns))
+        return replace(motion, turn=self.gyro.predict(motion.stamps_ns[1], stamp_ns))
 
     def look(self, active: ActiveMap, motion: Motion, placed: PlacedFrame) -> None:
         """Find what the image of a frame shows, before it changes the map.   motion: before it."""
@@ -73,7 +76,7 @@ class FrameTurns:
         gyro, stamp_ns, last = self.gyro, placed.frame.stamp_ns, self.last
         if gyro is None or gyro.is_over:
             return
-        R, here = placed.T_world_camera[:3, :3], self.here
+        R, here = placed.T_world_camera[:3, :3].copy(), self.here
         if here is None:
             here = ByImage(stamp_ns=stamp_ns, R=R, variance=0.0)
         before_ns, before = motion.stamps_ns[1], motion.poses[1][:3, :3]
@@ -81,5 +84,6 @@ class FrameTurns:
             at_first = 0.0
             if last is not None and last.stamp_ns == before_ns:
                 before, at_first = before @ self.R_last.T @ last.R, last.variance
+            gyro.frames += motion.turn is not None
             gyro.see(before_ns, stamp_ns, before.T @ here.R, (at_first, here.variance))
         self.last, self.R_last, self.here = here, R, None
