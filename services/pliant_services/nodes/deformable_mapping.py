@@ -52,7 +52,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
         found = _take(state, tracks, update, monitor)
         message = DeformingLandmarks.of(tracks, found, frame_id=WORLD_FRAME_ID)
         bus.publish(topics.MAP_DEFORMING, message)
-        monitor.report(tracks, note=found.problem, landmarks=len(found.ids))
+        monitor.report(tracks, landmarks=len(found.ids))
         bus.checkpoint(tracks.frame, tuple(vars(state).values()))
 
 
