@@ -10,7 +10,8 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.deformable.window import SIGMA, WindowMap
+from pliant.algorithms.deformable.deforming_window import SIGMA
+from pliant.algorithms.deformable.moving_landmarks import WindowMap
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_delta import TRACKING, KeyframeDelta, MapDelta
 from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints

@@ -247,7 +247,7 @@ class MapHistory(CurrentMap):
             self.online[frame] = (known.segment, matrix_to_pose(self._world(known))[0])
 
     def forget_before(self, frame: int) -> None:
-        """Drop what is known of earlier frames; the map stays."""
+        """Drop earlier frames; the map stays."""
         for table in (self.stamps_ns, self.online, self.frames, self.states):
             for old in [number for number in table if number < frame]:
                 del table[old]

@@ -9,7 +9,8 @@ import numpy as np
 
 from benchmarks.table import markdown
 from pliant.algorithms.arrays import F64, I64
-from pliant.algorithms.deformable.window import DeformingWindow, WindowMap
+from pliant.algorithms.deformable.deforming_window import DeformingWindow
+from pliant.algorithms.deformable.moving_landmarks import WindowMap
 from pliant.algorithms.geometry import inverse, pose_to_matrix, transform
 from pliant.algorithms.map_delta import TRACKING
 from pliant.algorithms.slam.calibration.corrected_view import corrected_view

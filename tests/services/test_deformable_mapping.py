@@ -85,7 +85,7 @@ def test_a_message_for_every_frame_and_a_map_every_second(mapped: list[Header]) 
         assert message.frames.tolist()[-1:] == ([message.frame] if len(message.ids) else [])
 
 
-def test_a_service_that_is_started_again_goes_on(inputs: Messages, mapped: list[Header]) -> None:
+def test_a_service_that_is_started_again_continues(inputs: Messages, mapped: list[Header]) -> None:
     config, before = load_config(), 31
     kept = Stopping(inputs, before)
     deformable_mapping.run(kept, config, SilentMonitor())

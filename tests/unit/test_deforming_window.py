@@ -8,7 +8,8 @@ from breathing_truth import CAMERA, rigid_map, tracks, write_truth
 from surfel_scene import STEP_S, board_renderer
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.deformable.window import DeformingWindow, WindowMap
+from pliant.algorithms.deformable.deforming_window import DeformingWindow
+from pliant.algorithms.deformable.moving_landmarks import WindowMap
 from pliant.algorithms.geometry import inverse, pose_to_matrix, so3_exp, transform
 from pliant.algorithms.slam.calibration.corrected_view import corrected_view
 from pliant.algorithms.surfels.parameters import SurfelParameters

@@ -12,7 +12,8 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.deformable.window import DeformingWindow, WindowMap
+from pliant.algorithms.deformable.deforming_window import DeformingWindow
+from pliant.algorithms.deformable.moving_landmarks import WindowMap
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_delta import TRACKING
 from pliant.algorithms.slam.calibration.corrected_view import corrected_view

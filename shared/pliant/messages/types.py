@@ -9,7 +9,7 @@ from typing import Annotated, Any, TypeVar
 
 from pliant.algorithms.arrays import F32, F64, I32, U8, Shape
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.deformable.window import WindowMap
+from pliant.algorithms.deformable.moving_landmarks import WindowMap
 from pliant.algorithms.inertial.samples import GpsFixes, ImuSamples
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.meshing.mesh_blocks import MeshBlocks, no_rows

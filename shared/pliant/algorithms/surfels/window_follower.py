@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
+from pliant.algorithms.deformable.deforming_window import SPAN_NS
+from pliant.algorithms.deformable.moving_landmarks import WindowMap
 from pliant.algorithms.deformable.priors import STIFF
-from pliant.algorithms.deformable.window import SPAN_NS, WindowMap
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
