@@ -11,7 +11,9 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -72,7 +74,6 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
     _keep_freed_memory()
     collected_after = gc.get_threshold()
     gc.set_threshold(_LOADED_OBJECTS)
-    module = importlib.import_module(process.module)
     arguments = dict(options.arguments)
     if not process.inputs and not process.observer:
         interrupted = stop_on_signal()
@@ -83,8 +84,7 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
     open_session(
         options.endpoints, options.identity
     ).close()  # said now, not after a minute of compiling
-    if process.kernels:
-        module.warm_up()
+    module = loaded(name)
     gc.freeze()
     gc.set_threshold(*collected_after)
     os.nice(process.niceness)
@@ -135,6 +135,16 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
         bus.see_off()
     if lost is not None:
         raise lost
+
+
+@cache
+def loaded(name: str) -> ModuleType:
+    """The module of a service, with its kernels compiled or loaded."""
+    process = processes.BY_NAME[name]
+    module = importlib.import_module(process.module)
+    if process.kernels:
+        module.warm_up()
+    return module
 
 
 def _keep_freed_memory() -> None:
