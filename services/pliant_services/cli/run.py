@@ -234,8 +234,7 @@ def run(
     if quiet and (poses or view):
         raise typer.BadParameter("--quiet prints nothing: leave out --quiet, or --poses and --view")
     with silence() if quiet else nullcontext(), ForkServer(PROFILES[profile]) as server:
-        # It imports what services need, while this process imports what it needs itself.
-        from pliant.datasets.source_spec import SourceSpec
+        from pliant.datasets.source_spec import SourceSpec  # the server imports at the same time
         from pliant_services.run.command import RunRequest, run_pipeline
 
         spec = SourceSpec(

@@ -66,7 +66,7 @@ _WRITTEN_AGAIN = "the run was already complete: its results are written again"
 def run_pipeline(request: RunRequest, server: ForkServer | None = None) -> int:
     """Run the pipeline; returns the exit code.  Raises PliantError for what the user can mend.
 
-    server: starts the services.
+    server: forks the services, and imports what they need while this process checks the source.
 
     Everything is checked before an earlier result is touched.
     """

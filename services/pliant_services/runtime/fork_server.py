@@ -1,19 +1,20 @@
-"""Starts the services of a run as forks of one process, which imports and loads all that they need.
+"""Starts the services of a run as forks of one process, which has loaded all that they need.
 
-A service that starts by itself imports some 500 modules and loads its compiled kernels, as the
+A service that starts as a program imports hundreds of modules and loads compiled kernels, as the
 others do: four seconds of CPU for a run.  A fork has them already, and shares their memory.
 
 The server leaves as soon as all services are started.  They become children of the launcher then,
-which is their reaper (``PR_SET_CHILD_SUBREAPER``): it sees every exit code and signal as those of
-processes that it has started itself.  A server that dies or cannot be has no effect: what it has
-not started, the launcher starts as programs, and so whatever is started again later.
+which has made itself their reaper (``PR_SET_CHILD_SUBREAPER``): exit codes and signals reach it as
+those of processes that it starts itself.  Where the server dies, or the system has no such call,
+the launcher starts services as programs; so it does with what it starts again later.
 
-multiprocessing has a fork server, too.  It stays the parent of its processes and reports how they
-ended, so nobody learns that once it is killed, and restarts would meet services that still run.
+multiprocessing has a fork server, too, but that stays the parent: once it is killed, nobody learns
+any more whether a service runs.
 """
 
 import ctypes
 import gc
+import importlib
 import json
 import os
 import signal
@@ -25,29 +26,29 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 _MODULE = "pliant_services.runtime.fork_server"
 _SET_CHILD_SUBREAPER = 36  # of prctl.h
 _LONGEST = 1 << 16
 """Bytes of a request."""
 _SHOWN = 4096
-"""Bytes of a service's command that ``ps`` shows."""
+"""Bytes of a service's command line that ``ps`` shows at most."""
 _PATIENCE_S = 60.0
 _LEAVING_S = 5.0
 _LOOK_S = 0.002
-_LOADED_OBJECTS = 50_000  # as in host.py
+_LOADED_OBJECTS = 50_000  # new objects before garbage is looked for, as in host.py
 
 
 class ForkedProcess:
     """A process of the fork server, with the part of ``subprocess.Popen`` that a launcher uses.
 
-    It is a child of this process once the server has left: only then ``poll`` may be called.
+    It becomes a child of this process when the server is closed; before that it cannot be reaped.
     """
 
     def __init__(self, pid: int, stdin: IO[bytes], stdout: IO[bytes]) -> None:
         self.pid, self.stdin, self.stdout = pid, stdin, stdout
-        self.returncode: int | None = None
+        self.returncode: int | Any = None  # as subprocess has it: an exit code once it has ended
         self._reaping = threading.Lock()
 
     def poll(self) -> int | None:
@@ -78,60 +79,67 @@ class ForkedProcess:
 
 
 class ForkServer:
-    """The launcher's side.  Closed once all is started, or by leaving its context."""
+    """The launcher's side of the server; close it when all services are started."""
 
     def __init__(self, services: Sequence[str]) -> None:
         """Start a server that imports the modules of these services; returns at once."""
         self._process: subprocess.Popen[bytes] | None = None
-        if not _reaps_orphans(True):
+        if not _reap_orphans(True):
             return
-        self._link, others = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._link, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._link.settimeout(_PATIENCE_S)
-        with others:
+        with theirs:
             self._process = subprocess.Popen(
-                # The last word is room: forks show their own command there.
+                # The last word is room: forks show their own command line there.
                 [sys.executable, "-m", _MODULE, *services, " " * _SHOWN],
-                stdin=others,  # it ends when the launcher is gone
-                stdout=subprocess.PIPE,  # as its forks have: Python asks once whether it can seek
-                stderr=subprocess.STDOUT,
+                stdin=theirs.fileno(),  # it ends when the launcher is gone
+                stdout=subprocess.PIPE,  # as in its forks: Python asks once whether it can seek
+                stderr=subprocess.STDOUT,  # what is wrong, a service started as a program reports
                 start_new_session=True,  # Ctrl-C reaches the launcher alone
             )
 
     def load(self, services: Sequence[str]) -> None:
-        """Load the kernels of these services, which are compiled; returns at once."""
+        """Load the compiled kernels of these services; returns at once."""
         if self._process is not None:
             try:
-                self._link.send(json.dumps(list(services)).encode())
+                self._link.send(json.dumps({"load": list(services)}).encode())
             except OSError:
                 self.close()
 
     def start(self, arguments: Sequence[str]) -> ForkedProcess | None:
-        """Start ``pliant`` with these arguments; None where that takes a program of its own."""
+        """Start ``pliant`` with these arguments; None if it has to be started as a program."""
         if self._process is None:
             return None
-        with ExitStack() as own, ExitStack() as given:
-            stdin, writing = _pipe(given, own, writes=True)
-            stdout, reading = _pipe(given, own, writes=False)
+        with ExitStack() as ours, ExitStack() as theirs:
+            stdin, written = os.pipe()
+            theirs.callback(os.close, stdin)
+            writing = ours.enter_context(open(written, "wb", buffering=0))
+            read, stdout = os.pipe()
+            theirs.callback(os.close, stdout)
+            reading = ours.enter_context(open(read, "rb"))
             try:
-                request = json.dumps({"arguments": list(arguments)}).encode()
+                request = json.dumps({"start": list(arguments)}).encode()
                 socket.send_fds(self._link, [request], [stdin, stdout])
                 pid = int(self._link.recv(_LONGEST))
-            except (OSError, ValueError):  # it has died: nothing is left to be read
+            except (OSError, ValueError):  # it has died: it sends nothing
                 self.close()
                 return None
-            with suppress(OSError):  # it has died already
-                writing.write(b"\n")  # the fork waits for it: one that we know nothing of ends
-            own.pop_all()
+            with suppress(OSError):  # killed in the meantime
+                writing.write(b"\n")  # a fork waits for this, so one that is not known here ends
+            ours.pop_all()
             return ForkedProcess(pid, writing, reading)
 
     def close(self) -> None:
-        """End the server; what it has started becomes ours.  May be called again."""
-        if self._process is not None:
-            self._link.close()
-            self._process.kill()
-            self._process.wait()
-            self._process = None
-            _reaps_orphans(False)
+        """End the server; the services become children of this process.  May be called again."""
+        if self._process is None:
+            return
+        self._link.close()
+        self._process.kill()
+        self._process.wait()
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+        self._process = None
+        _reap_orphans(False)
 
     def __enter__(self) -> "ForkServer":
         return self
@@ -140,53 +148,43 @@ class ForkServer:
         self.close()
 
 
-def _pipe(given: ExitStack, own: ExitStack, *, writes: bool) -> tuple[int, IO[bytes]]:
-    """The end of a new pipe for a service, and ours, which we write to, or read."""
-    read, write = os.pipe()
-    theirs, ours = (read, write) if writes else (write, read)
-    given.callback(os.close, theirs)
-    return theirs, own.enter_context(open(ours, "wb" if writes else "rb", buffering=0 if writes else -1))
-
-
-def _reaps_orphans(does: bool) -> bool:
-    """Have processes of ours whose parent ends become our children; False where none can."""
+def _reap_orphans(wanted: bool) -> bool:
+    """Whether descendants whose parent ends become our children from now on, as wanted."""
     if sys.platform != "linux":
         return False
-    return ctypes.CDLL(None).prctl(_SET_CHILD_SUBREAPER, int(does), 0, 0, 0) == 0
+    return ctypes.CDLL(None).prctl(_SET_CHILD_SUBREAPER, int(wanted), 0, 0, 0) == 0
 
 
 def _serve(services: Sequence[str]) -> None:
     """Import; then load kernels and fork as requested, until the launcher has closed its end.
 
-    Returns in a fork, whose command line is ``sys.argv``.
+    Returns in each fork, with its command line in ``sys.argv``.
     """
     usual = gc.get_threshold()
     gc.set_threshold(_LOADED_OBJECTS)
     link = socket.socket(fileno=os.dup(0))
-    import importlib
-
-    from pliant_services.cli import commands, service  # noqa: F401
-    from pliant_services.runtime import host, session_end  # noqa: F401
-    from pliant_services.processes import BY_NAME
-
+    host = importlib.import_module("pliant_services.runtime.host")
+    processes = importlib.import_module("pliant_services.processes")
+    for module in ("cli.commands", "runtime.session_end"):
+        importlib.import_module(f"pliant_services.{module}")
     for name in services:
-        importlib.import_module(BY_NAME[name].module)
+        importlib.import_module(processes.BY_NAME[name].module)
     while True:
         data, files, _, _ = socket.recv_fds(link, _LONGEST, 2)
         if not data:
             os._exit(0)
         request = json.loads(data)
-        if isinstance(request, list):
-            for name in request:
-                host.loaded(name)
-            gc.freeze()  # a fork that looks for garbage does not write to all of these pages
+        for name in request.get("load", ()):
+            host.loaded(name)
+        gc.freeze()  # else a fork that looks for garbage writes to all these pages
+        if "start" not in request:
             continue
         if not _is_alone():
-            os._exit(1)  # a fork would miss threads, and what they have locked
+            os._exit(1)  # a fork would lack the threads, and keep what they have locked
         pid = os.fork()
         if pid == 0:
             link.close()
-            _become(request["arguments"], *files)
+            _become(request["start"], *files)
             gc.set_threshold(*usual)
             return
         for file in files:
@@ -205,7 +203,7 @@ def _is_alone() -> bool:
 
 
 def _become(arguments: Sequence[str], stdin: int, stdout: int) -> None:
-    """Be a session of its own with these files and arguments, once the launcher knows of us."""
+    """Become a session with these files and arguments, once the launcher knows of this process."""
     os.setsid()
     for file, place in ((stdin, 0), (stdout, 1), (stdout, 2)):
         os.dup2(file, place)
@@ -218,10 +216,10 @@ def _become(arguments: Sequence[str], stdin: int, stdout: int) -> None:
 
 
 def _show(command: Sequence[str]) -> None:
-    """Have ``ps`` show a command line: it is written over the one that the server was given."""
+    """Have ``ps`` show this command line in place of the server's."""
     with suppress(OSError, ValueError, IndexError):
         fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
-        start, end = int(fields[45]), int(fields[46])
+        start, end = int(fields[45]), int(fields[46])  # arg_start and arg_end of proc(5)
         words = b"\0".join(os.fsencode(word) for word in command)[: end - start - 1]
         with open("/proc/self/mem", "r+b", buffering=0) as memory:
             memory.seek(start)
@@ -230,6 +228,4 @@ def _show(command: Sequence[str]) -> None:
 
 if __name__ == "__main__":
     _serve(sys.argv[1:-1])
-    from pliant_services.cli import main
-
-    main()
+    importlib.import_module("pliant_services.cli").main()

@@ -62,13 +62,12 @@ class Fleet:
     ) -> None:
         """Start the router.  ``port``: of it on loopback; else it is at a Unix socket where that
         works.  ``state``: folder of checkpoints; with it, services that die are started again.
-        ``server``: starts the services; else each is started as a program.
+        ``server``: forks the services, and may have been started earlier.
         Raises BusError when the port is in use."""
         self._services = tuple(services)
         self._log_folder = log_folder
         self._children: list[Child] = []
         self._state = state
-        self._server = server
         self._gave_up = False
         self._arguments: Callable[[str], Sequence[str]] = lambda name: ()
         self._frames: dict[str, int] = {}  # that each service reported last
@@ -76,6 +75,7 @@ class Fleet:
         self.session = f"run-{os.getpid()}"
         self._local = LocalRouter(port)
         self.endpoint, self.note = self._local.endpoint, self._local.note
+        self._server = server or ForkServer(services)
         self._router = self._local.session
         self._relay = Relay(self._router, self.session)
         self._ready: set[str] = set()
@@ -111,12 +111,10 @@ class Fleet:
         self._arguments = arguments
         for name in self._services:
             (self._log_folder / f"{name}.log").unlink(missing_ok=True)
-        if self._server is not None:
-            self._server.load(self._services)
+        self._server.load(self._services)
         for name in reversed(self._services):
             self._children.append(self._spawn(name))  # one by one: a Ctrl-C leaves none behind
-        if self._server is not None:
-            self._server.close()
+        self._server.close()
         deadline = time.monotonic() + READY_TIMEOUT_S
         while not self._ready >= set(self._services):
             self._all_left()  # who dies now is started again, too
@@ -188,8 +186,7 @@ class Fleet:
         Takes no more than that long, and cannot be interrupted: nothing may be left behind.
         """
         with _uninterrupted():
-            if self._server is not None:
-                self._server.close()
+            self._server.close()
             running = [child for child in self._children if child.process.poll() is None]
             for child in running:
                 child.process.send_signal(signal.SIGINT)
@@ -214,8 +211,7 @@ class Fleet:
             *(("--state", str(self._state)) if self._state is not None else ()),
             *self._arguments(name),
         ]
-        process = self._server.start(arguments) if self._server is not None else None
-        process = process or subprocess.Popen(
+        process = self._server.start(arguments) or subprocess.Popen(
             [sys.executable, "-m", "pliant_services.cli", *arguments],
             stdin=subprocess.PIPE,  # never written: it closes when the launcher is gone
             stdout=subprocess.PIPE,
