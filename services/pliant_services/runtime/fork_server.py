@@ -4,12 +4,12 @@ A service that starts as a program imports hundreds of modules and loads compile
 others do: four seconds of CPU for a run.  A fork has them already, and shares their memory.
 
 The server leaves as soon as all services are started.  They become children of the launcher then,
-which has made itself their reaper (``PR_SET_CHILD_SUBREAPER``): exit codes and signals reach it as
-those of processes that it starts itself.  Where the server dies, or the system has no such call,
-the launcher starts services as programs; so it does with what it starts again later.
+which has made itself their reaper (``PR_SET_CHILD_SUBREAPER``).  So it gets their exit codes and
+signals as those of programs that it starts.  Where the server dies, or the system has no such call,
+the launcher starts services as programs; so it does with those that it starts again after a crash.
 
-multiprocessing has a fork server, too, but that stays the parent: once it is killed, nobody learns
-any more whether a service runs.
+The fork server of multiprocessing stays the parent instead: if it is killed, all exit codes are
+lost, and services would be started again that still run.
 """
 
 import ctypes
@@ -175,7 +175,7 @@ def _serve(services: Sequence[str]) -> None:
             os._exit(0)
         request = json.loads(data)
         for name in request.get("load", ()):
-            host.loaded(name)
+            host.load_kernels(name)
         gc.freeze()  # else a fork that looks for garbage writes to all these pages
         if "start" not in request:
             continue

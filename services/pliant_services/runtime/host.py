@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -74,6 +73,7 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
     _keep_freed_memory()
     collected_after = gc.get_threshold()
     gc.set_threshold(_LOADED_OBJECTS)
+    module = importlib.import_module(process.module)
     arguments = dict(options.arguments)
     if not process.inputs and not process.observer:
         interrupted = stop_on_signal()
@@ -84,7 +84,7 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
     open_session(
         options.endpoints, options.identity
     ).close()  # said now, not after a minute of compiling
-    module = loaded(name)
+    load_kernels(name)
     gc.freeze()
     gc.set_threshold(*collected_after)
     os.nice(process.niceness)
@@ -138,13 +138,11 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
 
 
 @cache
-def loaded(name: str) -> ModuleType:
-    """The module of a service, with its kernels compiled or loaded."""
+def load_kernels(name: str) -> None:
+    """Load the compiled kernels of a service, or compile them; a fork of this process has them."""
     process = processes.BY_NAME[name]
-    module = importlib.import_module(process.module)
     if process.kernels:
-        module.warm_up()
-    return module
+        importlib.import_module(process.module).warm_up()
 
 
 def _keep_freed_memory() -> None:
