@@ -136,8 +136,8 @@ class Landmarks:
         """Move a segment."""
         rows = self.used(segment)
         S = moves.matrices(self.first_keyframe[rows].astype(np.int64))
-        self.xyz[rows] = transform_each(S, self.xyz[rows])
-        self.spread[rows] = (S[:, :3, :3] @ self.spread[rows][:, :, None])[:, :, 0]
+        self.xyz[rows] = transform_each(S, self.xyz.take(rows, 0))
+        self.spread[rows] = (S[:, :3, :3] @ self.spread.take(rows, 0)[:, :, None])[:, :, 0]
 
     def promote(self, rows: I32) -> None:
         """Turn candidates into landmarks, with ids in the given order."""
