@@ -188,8 +188,8 @@ class Journal:
             self._poses = np.append(self._poses, np.full((more, 4, 4), np.nan), axis=0)
 
     def _is_current(self, rows: I32) -> BoolArray:
-        same = self._ids[rows] == self._points.ids[rows]
-        return same & (self._hosts[rows] == self._points.first_keyframe[rows])
+        same = self._ids.take(rows) == self._points.ids.take(rows)
+        return same & (self._hosts.take(rows) == self._points.first_keyframe.take(rows))
 
     def _changed_keyframes(self, snapshot: bool) -> list[Keyframe]:
         """Return the keyframes to publish, and record them as published."""

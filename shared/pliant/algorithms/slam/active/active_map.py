@@ -153,9 +153,9 @@ class ActiveMap:
 
     def judge_tracks(self, tracks: I64, errors: F32) -> None:
         """Take tracks from points that they missed in several frames in a row."""
-        rows = self.links.rows[tracks]
+        rows = self.links.rows.take(tracks)
         bad = errors > 2.0 * self.parameters.localisation.inlier_px
-        strikes = np.where(bad, self.points.strikes[rows] + 1, 0).astype(np.uint8)
+        strikes = np.where(bad, self.points.strikes.take(rows) + 1, 0).astype(np.uint8)
         self.points.strikes[rows] = strikes
         lost = strikes >= _MAX_STRIKES
         self.points.strikes[rows[lost]] = 0

@@ -216,7 +216,7 @@ def reacquire_points(
         found = Observations(rows=found.rows, points_px=points_px, rolled_px=rolled_px)
     placed = refine_by_all(active, replace(placed, found=found))
     linked = active.linked(MAPPED)
-    points.kappas[active.links.rows[linked]] = tracks.kappas[linked]
+    points.kappas[active.links.rows.take(linked)] = tracks.kappas.take(linked)
     return placed
 
 
@@ -302,7 +302,7 @@ def _settled(active: ActiveMap, motion: Motion, tracks: FrameTracks) -> BoolArra
     points, parameters = active.points, active.parameters
     rows = active.links.rows
     newest = active.keyframes[-1].id
-    seen_by = np.where(rows != UNLINKED, newest + 1 - points.first_keyframe[rows], 0)
+    seen_by = np.where(rows != UNLINKED, newest + 1 - points.first_keyframe.take(rows), 0)
     old = tracks.ages * motion.interval_s() >= SETTLED_S
     return old & (seen_by >= parameters.point.min_observations)
 
@@ -311,7 +311,7 @@ def _contradicting(active: ActiveMap, T_world_camera: F64, points_px: F32) -> I6
     """Indices of the tracks of candidates that no depth makes consistent with the pose."""
     points = active.points
     candidates = placed_candidates(points, active.links.rows)
-    rows = active.links.rows[candidates]
+    rows = active.links.rows.take(candidates)
     off = off_epipolar_line(
         T_world_camera, points.xyz.take(rows, 0), points.spread.take(rows, 0),
         points_px.take(candidates, 0), active.camera,

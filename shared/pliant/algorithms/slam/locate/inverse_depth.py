@@ -102,6 +102,9 @@ def at_infinity(points_world: F64, centre: F64) -> BoolArray:
     points_world: (N, 3).   centre: (3,) of a camera that is among them.
     """
     distances = lengths(points_world - centre)
+    # The median is no less than the minimum: mostly there is no need to know it.
+    if len(distances) and distances.max() <= _ENDLESS * distances.min():
+        return np.zeros(len(distances), np.bool_)
     median = np.median(distances) if len(distances) else 0.0
     return ~(distances <= _ENDLESS * median)
 
