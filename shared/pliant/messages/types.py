@@ -179,8 +179,8 @@ class Image(Header):
 
     grey: (H, W).     colour: (H, W, 3) RGB, or (0, 0, 3) where the source has none.
     missing: "" or why there are no pixels ("dropped", "broken: ..."); both arrays are empty then.
-    jpeg, calibration: over a link, instead of pixels, what they are made from: the source's JPEG
-    and its camera as YAML; ``pliant_services.runtime.link_images`` makes them.
+    jpeg, calibration: instead of colours, and over a link of all pixels, what they are made from:
+    the source's JPEG and its camera as YAML; ``pliant_services.runtime.link_images`` makes them.
     unmapped: bundle adjustment only localises this frame, by its tracks, as it is behind (live
     mode).   unplaced: it is so far behind that it does not do that either.
     mask: which pixels are used, as of ``pliant.algorithms.image.masks``; b"": all of them.
