@@ -91,10 +91,18 @@ PROCESSES: tuple[Process, ...] = (
         kernels=True,
     ),
     Process(
+        "deformable_mapping",
+        "pliant_services.nodes.deformable_mapping",
+        inputs=(topics.STREAM, topics.EXTREMA, topics.MAP_UPDATE),
+        outputs=(topics.MAP_DEFORMING,),
+        may_lag=True,
+        kernels=True,
+    ),
+    Process(
         "surfels",
         "pliant_services.nodes.surfels",
         inputs=(topics.STREAM, topics.IMAGE, topics.DEPTH),
-        optional=(topics.EXTREMA, topics.MAP_UPDATE, topics.KEYFRAME),
+        optional=(topics.EXTREMA, topics.MAP_UPDATE, topics.KEYFRAME, topics.MAP_DEFORMING),
         outputs=(topics.SURFELS,),
         may_lag=True,  # with a map: it reads an update for every frame
         kernels=True,

@@ -4,7 +4,9 @@ PROFILES: dict[str, tuple[str, ...]] = {
     "rigid": ("ingest", "tracking", "bundle_adjustment", "meshing", "recorder"),
     "points": ("ingest", "tracking", "bundle_adjustment", "recorder"),
     "deformable": ("ingest", "surfels", "recorder"),
-    "deformable-map": ("ingest", "tracking", "bundle_adjustment", "surfels", "recorder"),
+    "deformable-map": (
+        *("ingest", "tracking", "bundle_adjustment", "deformable_mapping", "surfels", "recorder"),
+    ),
 }
 """``deformable`` becomes ``deformable-map`` where surfels get their depth from Pliant's own map."""
 NAMES = tuple(dict.fromkeys(name for fleet in PROFILES.values() for name in fleet))

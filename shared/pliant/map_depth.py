@@ -10,6 +10,8 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.deformable.deforming_window import SIGMA
+from pliant.algorithms.deformable.moving_landmarks import WindowMap
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_delta import TRACKING, KeyframeDelta, MapDelta
 from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints
@@ -28,6 +30,24 @@ class MapView:
     depth: F64
     T_world_camera: F64  # (4, 4)
     segment: int
+
+
+def view_of_window(found: WindowMap, camera: PinholeCamera, segment: int) -> MapView | None:
+    """The depth of the newest keyframe of a window, None where its landmarks make no surface."""
+    rows = found.in_view
+    count = len(rows)
+    points = SeenPoints(
+        ids=found.ids[rows],
+        points_px=found.points_px[rows],
+        points_world=(found.rest + found.moved()[-1])[rows],
+        sigmas=np.full(count, SIGMA / SurfaceParameters().noise_px, np.float32),
+        keyframes=np.full(count, len(found.frames), np.int32),
+    )
+    T_world_camera = found.T_world_camera[-1]
+    surface = KeyframeSurfaces(camera, SurfaceParameters()).surface(T_world_camera, points)
+    if surface.depth_map is None:
+        return None
+    return MapView(surface.depth_map.depths.astype(np.float64), T_world_camera, segment)
 
 
 class MapDepth:

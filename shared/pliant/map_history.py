@@ -246,6 +246,12 @@ class MapHistory(CurrentMap):
         if known is not None and known.inliers >= MIN_INLIERS:
             self.online[frame] = (known.segment, matrix_to_pose(self._world(known))[0])
 
+    def forget_before(self, frame: int) -> None:
+        """Drop earlier frames; the map stays."""
+        for table in (self.stamps_ns, self.online, self.frames, self.states):
+            for old in [number for number in table if number < frame]:
+                del table[old]
+
     def _scale(self, moves: MapMoves) -> None:
         """Distances of frames to their keyframes scale as the whole map moves."""
         hanging = np.array([pose.keyframe for pose in self.frames.values()], np.int64)

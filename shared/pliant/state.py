@@ -38,7 +38,7 @@ _CLASSES = {
     *("ExtremaTracker", "BriefExtractor", "Mapper", "BootstrapMapper", "Localiser", "Atlas"),
     *("ActiveMap", "EarlierSegments", "Landmarks", "TrackLinks", "Window", "FramePoses"),
     "Journal",
-    *("SurfelTracker", "MapDepth", "CurrentMap", "_PointTable"),
+    *("SurfelTracker", "MapDepth", "CurrentMap", "MapHistory", "_PointTable"),
 }
 """Classes that are neither dataclasses, named tuples, nor parameters."""
 _FUNCTIONS = {"no_stages"}

@@ -41,6 +41,7 @@ _MEMORY_LOOKS = 20
 _TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 _ROOT = Path(pliant.__file__).parents[2]
 _LAUNCHER = "launcher"
+_FORK_SERVER = b"pliant_services.runtime.fork_server"
 _COPIED = 64 << 20
 
 _KINDS = {
@@ -204,7 +205,9 @@ def _look(launcher: int, *, memory: bool) -> _Look:
             place = Path(f"/proc/{pid}")
             words = (place / "cmdline").read_bytes().split(b"\0")
             name = _LAUNCHER
-            if pid != launcher:
+            if _FORK_SERVER in words:
+                name = "fork server"
+            elif pid != launcher:
                 name = words[words.index(b"service") + 1].decode()
             fields = (place / "stat").read_text().rpartition(")")[2].split()
             peak_kb = re.findall(r"VmHWM:\s+(\d+) kB", (place / "status").read_text())[0]

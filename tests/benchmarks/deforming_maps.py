@@ -1,6 +1,7 @@
 """The final map of scenes that deform against exact ground truth, and why others have none."""
 
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -8,12 +9,18 @@ import numpy as np
 
 from benchmarks.table import markdown
 from pliant.algorithms.arrays import F64, I64
+from pliant.algorithms.deformable.deforming_window import DeformingWindow
+from pliant.algorithms.deformable.moving_landmarks import WindowMap
+from pliant.algorithms.geometry import inverse, pose_to_matrix, transform
+from pliant.algorithms.map_delta import TRACKING
+from pliant.algorithms.slam.calibration.corrected_view import corrected_view
 from pliant.config import load_config
 from pliant.datasets import open_source
 from pliant.datasets.builtin import builtin_folder
 from pliant.datasets.rectifier import Rectifier
 from pliant.evaluation.deforming_map_truth import DeformingMapErrors, judge_deforming_map
 from pliant.evaluation.surface_truth import SurfaceTruth
+from pliant.evaluation.surfel_truth import rmse
 from pliant.map_history import MapHistory
 from pliant.offline import Pipeline
 from pliant.results.deforming_map import adjust_and_write
@@ -39,32 +46,82 @@ _HEADER = (
 )
 
 
+_WINDOWS = ("sequence", "windows", "trusted", "shape %", "units %", "camera %", "ms each")
+
+
 def measure_maps(sources: Sequence[str]) -> Iterator[str]:
-    """Row by row; the map is made by the rigid pipeline in this process."""
+    """Row by row; the maps are made by the rigid pipeline in this process."""
     yield "\nfinal map, all frames"
     yield markdown(_HEADER, [])
+    windows: list[list[str]] = []
     for source in sources or _SOURCES:
-        found = _judged(source)
+        found, row = _judged(source)
         cells = ["none", found] if isinstance(found, str) else _cells(found)
+        windows.append([_short(source), *row])
         yield "| " + " | ".join([_short(source), *cells]) + " |"
+    yield "\nwhile it runs: the map of the last 3 s, once a second"
+    yield markdown(_WINDOWS, windows)
 
 
-def _judged(source: str) -> DeformingMapErrors | str:
-    """Errors, or why there is no map."""
+def _judged(source: str) -> tuple[DeformingMapErrors | str, list[str]]:
+    """Errors, or why there is no map; and a row of the windows."""
     dataset, history = open_source(source), MapHistory()
     pipeline = Pipeline(dataset.calibration, load_config(), history)
-    tracks: list[tuple[int, I64, F64]] = []
-    for frame in dataset:
-        found = pipeline.take(frame).tracks
-        tracks.append((frame.index, found.ids, found.points_px.astype(np.float64)))
-    pipeline.finish()
     camera = Rectifier(dataset.calibration).camera
+    tracks: list[tuple[int, I64, F64]] = []
+    window, windows, spent_s = DeformingWindow(), list[WindowMap](), 0.0
+    for frame in dataset:
+        mapped = pipeline.take(frame)
+        found = mapped.tracks
+        tracks.append((frame.index, found.ids, found.points_px.astype(np.float64)))
+        if mapped.delta.state != TRACKING:
+            continue
+        if window.take(frame.index, frame.stamp_ns, found.ids, found.points_px):
+            poses = {
+                n: pose_to_matrix(pose[None])[0]
+                for n, (segment, pose) in history.final().items()
+                if segment == mapped.delta.segment
+            }
+            begun_s = time.process_time()
+            windows.append(window.adjust(poses, corrected_view(camera, ())))
+            spent_s += time.process_time() - begun_s
+    pipeline.finish()
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "deforming_map.npz"
         problem = adjust_and_write(file, history, camera, tracks)
-        if problem:
-            return problem
-        return judge_deforming_map(file, SurfaceTruth(builtin_folder(source), camera))
+        trusted = [each for each in windows if len(each.frames)]
+        row = [str(len(windows)), str(len(trusted))]
+        if not trusted:
+            return problem, [*row, "", "", "", ""]
+        truth = SurfaceTruth(builtin_folder(source), camera)
+        row += [*_window_cells(trusted, truth), f"{1e3 * spent_s / len(windows):.0f}"]
+        return problem or judge_deforming_map(file, truth), row
+
+
+def _window_cells(windows: Sequence[WindowMap], truth: SurfaceTruth) -> list[str]:
+    """RMSE of the landmarks in view in the camera's frame, each window in its own unit; standard
+    deviation of these units; RMSE of the motion of the camera over a window, by the depth."""
+    units, shapes, cameras = list[float](), list[float](), list[float]()
+    for found in windows:
+        rows, frame = found.in_view, int(found.frames[-1])
+        points = truth.at_pixels(frame, found.points_px[rows].astype(np.float64))
+        T_true = truth.T_world_camera[found.frames[[0, -1]]]
+        exact = transform(inverse(T_true[1]), truth.positions(points, frame))
+        T = found.T_world_camera
+        there = transform(inverse(T[-1]), (found.rest + found.moved()[-1])[rows])
+        known = np.isfinite(exact).all(axis=1)
+        exact, there = exact[known], there[known]
+        unit = float(np.median(exact[:, 2] / there[:, 2]))
+        shapes.append(rmse((unit * there - exact) / exact[:, 2:]))
+        motion = unit * (inverse(T[0]) @ T[-1])[:3, 3] - (inverse(T_true[0]) @ T_true[1])[:3, 3]
+        cameras.append(float(np.linalg.norm(motion)) / float(exact[:, 2].mean()))
+        units.append(unit)
+    figures = (
+        rmse(np.array(shapes)[:, None]),
+        np.std(units) / np.mean(units),
+        rmse(np.array(cameras)[:, None]),
+    )
+    return [f"{100.0 * figure:.2f}" for figure in figures]
 
 
 def _cells(errors: DeformingMapErrors) -> list[str]:

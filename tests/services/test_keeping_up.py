@@ -285,7 +285,11 @@ def test_only_who_reads_what_is_passed_over_may_lag() -> None:
     config = Config()
     assert lags(config, PROFILES["deformable"]) == {}
     assert lags(config, PROFILES["rigid"]).keys() == {"bundle_adjustment"}
-    assert lags(config, PROFILES["deformable-map"]).keys() == {"bundle_adjustment", "surfels"}
+    assert lags(config, PROFILES["deformable-map"]).keys() == {
+        "bundle_adjustment",
+        "deformable_mapping",
+        "surfels",
+    }
 
 
 def test_the_longest_wait_is_the_reason_for_dropped_images() -> None:

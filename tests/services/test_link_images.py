@@ -13,6 +13,7 @@ from pliant.datasets import open_source
 from pliant.datasets.base import Dataset, SourceFrame, encoding_of
 from pliant.datasets.calibration import calibration_yaml
 from pliant.datasets.jpeg import jpeg_size
+from pliant.datasets.rectifier import Rectifier
 from pliant.errors import MessageError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
@@ -73,7 +74,7 @@ def wire(images: list[Image]) -> list[bytes]:
 @pytest.mark.parametrize("jpegs", [False, True])
 def test_lossless_is_lossless_also_of_jpegs_which_cross_themselves(jpegs: bool) -> None:
     raw, lossless = ingested("raw", jpegs=jpegs), ingested("lossless", jpegs=jpegs)
-    assert wire(read(lossless)) == wire(read(raw))
+    assert wire(read(lossless)) == wire([whole(image) for image in read(raw)])
     assert lossless[topics.SOURCE] == raw[topics.SOURCE]
     crossing = [image.jpeg for image in lossless[topics.IMAGE] if isinstance(image, Image)]
     sources = [source.data for source in raw[topics.SOURCE] if isinstance(source, SourceImage)]
@@ -110,6 +111,23 @@ class _Recorded(_Jpegs):
                 index=source.frame, stamp_ns=source.stamp_ns,
                 encoding=source.encoding, data=source.data,
             )  # fmt: skip
+
+
+def test_on_one_machine_grey_crosses_and_the_colours_of_a_jpeg_stay_in_it() -> None:
+    frames = list(_Jpegs(open_source(SOURCE + "&colour=true")))
+    bus = ReplayBus({})
+    source = _Jpegs(open_source(SOURCE + "&colour=true"))
+    ingest.run(bus, load_config(), SilentMonitor(), source, stopping=lambda: False)
+    sent = [image for image in bus.outputs[topics.IMAGE] if isinstance(image, Image)]
+    assert [image.colour.size for image in sent] == [0, 0, 0]
+    assert [image.jpeg for image in sent] == [frames[0].data, b"", frames[2].data]
+    rectifier = Rectifier(source.calibration)
+    for image, frame in zip(sent[::2], frames[::2], strict=True):
+        grey, colour = rectifier.rectify(frame)
+        assert colour is not None
+        np.testing.assert_array_equal(image.grey, grey)
+        np.testing.assert_array_equal(whole(image).grey, grey)
+        np.testing.assert_array_equal(whole(image).colour, colour)
 
 
 @pytest.mark.parametrize("how", ["raw", "lossless", "jpeg"])

@@ -33,7 +33,13 @@ from pliant.messages.types import (
     MapUpdate,
     Surfels,
 )
-from pliant_services.nodes import bundle_adjustment, ingest, surfels, tracking
+from pliant_services.nodes import (
+    bundle_adjustment,
+    deformable_mapping,
+    ingest,
+    surfels,
+    tracking,
+)
 from pliant_services.processes import BY_NAME
 from pliant_services.runtime.monitor import SilentMonitor
 
@@ -57,7 +63,8 @@ def everything() -> Messages:
     dataset = open_source(SourceSpec(location=f"{SOURCE}&frames={FRAMES}", depth="all"))
     ingest.run(source, config, monitor, dataset, stopping=lambda: False)
     made = dict(source.outputs)
-    for name, service in (("tracking", tracking), ("bundle_adjustment", bundle_adjustment)):
+    for service in (tracking, bundle_adjustment, deformable_mapping):
+        name = service.__name__.rpartition(".")[2]
         bus = ReplayBus({topic: made[topic] for topic in BY_NAME[name].inputs})
         service.run(bus, config, monitor)
         made |= bus.outputs

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping_scene import CAMERA, Scene, looking
 
-from pliant.algorithms.geometry import inverse, transform
+from pliant.algorithms.geometry import inverse, lengths, transform
 from pliant.algorithms.slam.estimate.observation_table import (
     count_in_view,
     forget_outliers,
@@ -36,6 +36,27 @@ from pliant.algorithms.slam.parameters import (
     LocalisationParameters,
     ReacquisitionParameters,
 )
+
+
+def test_lengths_have_the_bytes_of_the_norm():
+    vectors = (
+        np.random.default_rng(0).normal(size=(5000, 3)) * np.geomspace(1e-9, 1e9, 5000)[:, None]
+    )
+    assert lengths(vectors).tobytes() == np.linalg.norm(vectors, axis=1).tobytes()
+
+
+def test_reused_rows_are_as_clear_as_new_ones():
+    points = Landmarks()
+    rows = points.allocate(3, keyframe=1)
+    points.place(rows, np.ones((3, 3)), 0.5, 0.1)
+    points.kappas[rows], points.colours[rows], points.misses[rows] = 7.0, 200, 9
+    points.free(rows[:2])
+    again = points.allocate(3, keyframe=2)
+    assert again.tolist() == [0, 1, 3]
+    for values in (v for v in vars(points).values() if isinstance(v, np.ndarray) and v.size):
+        np.testing.assert_array_equal(
+            values[0], values[3] - 3 if values is points.alias else values[3]
+        )
 
 
 def test_rows_are_reused_and_ids_never():

@@ -201,8 +201,8 @@ def run(
 
     pliant run path/to/tissue --profile deformable --camera moving --depth map
     """
-    from pliant.datasets.source_spec import SourceSpec
-    from pliant_services.run.command import RunRequest, run_pipeline
+    from pliant_services.profiles import PROFILES
+    from pliant_services.runtime.fork_server import ForkServer
 
     sets = [_LIGHT] if light else []
     sets += [*(overrides or []), *([f"ingest.mode={mode}"] if mode else [])]
@@ -231,34 +231,37 @@ def run(
     localising = ["bundle_adjustment.only_localise=true", "meshing.enabled=false"]
     sets += localising if localise else []
     sets += [] if images else ["recorder.images=false"]
-    spec = SourceSpec(
-        location=source,
-        calibration=calibration,
-        fov_deg=fov,
-        topic=topic,
-        mask=mask,
-        imu=imu,
-        gps=gps,
-    )
-    request = RunRequest(
-        source=spec,
-        profile=profile,
-        output=output,
-        force=force,
-        config_file=config_file,
-        overrides=sets,
-        seed=seed,
-        known=known,
-        view=view,
-        save=save,
-        poses=poses,
-        port=port,
-        on_crash=on_crash,
-        resume=resume,
-        quality=quality,
-    )
     if quiet and (poses or view):
         raise typer.BadParameter("--quiet prints nothing: leave out --quiet, or --poses and --view")
-    with silence() if quiet else nullcontext():
-        code = run_pipeline(request)
+    with silence() if quiet else nullcontext(), ForkServer(PROFILES[profile]) as server:
+        from pliant.datasets.source_spec import SourceSpec  # the server imports at the same time
+        from pliant_services.run.command import RunRequest, run_pipeline
+
+        spec = SourceSpec(
+            location=source,
+            calibration=calibration,
+            fov_deg=fov,
+            topic=topic,
+            mask=mask,
+            imu=imu,
+            gps=gps,
+        )
+        request = RunRequest(
+            source=spec,
+            profile=profile,
+            output=output,
+            force=force,
+            config_file=config_file,
+            overrides=sets,
+            seed=seed,
+            known=known,
+            view=view,
+            save=save,
+            poses=poses,
+            port=port,
+            on_crash=on_crash,
+            resume=resume,
+            quality=quality,
+        )
+        code = run_pipeline(request, server)
     raise typer.Exit(code)

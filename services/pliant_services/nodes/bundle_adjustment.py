@@ -18,13 +18,16 @@ out  map/update       one per frame: pose, points, keyframes, corrections of ear
 Global bundle adjustment runs in a thread, in parallel with tracking, see ``global_adjustment.py``.
 """
 
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache, partial
 from itertools import islice
 from typing import TypeAlias
 
 import cv2
 import numpy as np
 
+from pliant.algorithms.arrays import U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import so3_exp
 from pliant.algorithms.image.masks import filled
@@ -102,6 +105,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     for image, tracks in join(receive_images(bus, mapped_only=True), extrema):
         if by_frame:
             mapper.add_samples(imu_in(islice(pieces, 1)))
+        entire = cache(partial(whole, image))
         if tracks.missing:
             delta = mapper.skip(tracks.frame)
         elif image.unplaced:
@@ -112,21 +116,20 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
                 delta = mapper.only_localise(frame, PASSED_OVER)
         else:
             worker.hand_over(mapper.global_adjustment, tracks.frame)
-            colour = image.colour if image.colour.size else None
             covered = clearance(image)
             grey = filled(image.grey, covered)
             with monitor.stage("maxima"):
                 seen = FrameExtrema.of(tracks, maxima_of(grey, config.tracking, covered))
-            frame = Frame(tracks.frame, tracks.stamp_ns, seen, grey, colour)
+            frame = Frame(tracks.frame, tracks.stamp_ns, seen, grey, partial(_colour, entire))
             delta = mapper.process(frame, monitor.stage)
         bus.publish(topics.MAP_UPDATE, _update(tracks, delta))
         keyframes = mapper.publish_keyframes()
         if tracks.frame in delta.keyframe_frames:
-            waiting[tracks.frame] = _kept(image)
+            waiting[tracks.frame] = _kept(entire())
         bus.publish(topics.KEYFRAME, _keyframe(image, keyframes, delta, waiting))
         needed = mapper.waiting_frames
         if tracks.frame in needed:
-            waiting[tracks.frame] = _kept(image)
+            waiting[tracks.frame] = _kept(entire())
         waiting = {frame: waiting[frame] for frame in needed}
         monitor.report(
             tracks,
@@ -199,8 +202,12 @@ def _keyframe(
     )
 
 
+def _colour(entire: Callable[[], Image]) -> U8 | None:
+    colour = entire().colour
+    return colour if colour.size else None
+
+
 def _kept(image: Image) -> _Kept:
-    image = whole(image) if image.jpeg else image
     pixels = image.colour[..., ::-1] if image.colour.size else image.grey
     quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
     return cv2.imencode(".jpg", pixels, quality)[1].tobytes(), image.mask

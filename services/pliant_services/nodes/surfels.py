@@ -5,16 +5,17 @@ in   camera/stream    once
      camera/depth     every frame: empty, or a depth map: the first one starts the surfels
      tracks/extrema   every frame, where tracking runs: where surfels may have gone
      map/update, map/keyframe   every frame, where bundle adjustment runs: depths for births
+     map/deforming    every frame, where deformable mapping runs: better ones, and the camera
 out  surfels/state    one per frame: all surfels, and the camera; empty without pixels
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, U8
+from pliant.algorithms.arrays import F32, F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.image.masks import glaring
 from pliant.algorithms.surfels.depth_maps import agree
@@ -22,6 +23,7 @@ from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.prediction import predict
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
+from pliant.algorithms.surfels.window_follower import WindowFollower
 from pliant.algorithms.tracks import FrameTracks
 from pliant.bus.base import Bus, join, receive, receive_one, resume
 from pliant.config import Config
@@ -29,12 +31,13 @@ from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import calibration_from_yaml
 from pliant.datasets.depth import DepthRectifier
 from pliant.errors import ConfigError
-from pliant.map_depth import MapDepth, MapView
+from pliant.map_depth import MapDepth, MapView, view_of_window
 from pliant.messages import topics
 from pliant.messages.types import (
     WAITING_FOR_DEPTH,
     WORLD_FRAME_ID,
     CameraStream,
+    DeformingLandmarks,
     Depth,
     Extrema,
     Image,
@@ -50,13 +53,15 @@ _FLAT_DEPTH = 1.0
 
 @dataclass(frozen=True)
 class _Heard:
-    """The inputs of one frame.  tracks, update, keyframe: where a service publishes them."""
+    """The inputs of one frame.  tracks, update, keyframe, deforming: where a service publishes
+    them."""
 
     image: Image
     depth: Depth
     tracks: Extrema | None = None
     update: MapUpdate | None = None
     keyframe: Keyframe | None = None
+    deforming: DeformingLandmarks | None = None
 
     @property
     def frame(self) -> int:
@@ -78,6 +83,7 @@ class _State:
     points_px: F32
     ratio: float = 1.0
     segment: int = -1
+    follower: WindowFollower = field(default_factory=WindowFollower)
 
 
 def run(bus: Bus, config: Config, monitor: Monitor) -> None:
@@ -109,7 +115,8 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
                 frame = state.tracker.track(image.grey, interval_s, prediction, metres)
             if view is not None:
                 with monitor.stage("births"):
-                    frame, note = _add(state, image.grey, frame, view, config)
+                    frame, note = _add(state, image, frame, view, config)
+            state.follower.note(image.frame, image.stamp_ns, frame)
         elif not missing:
             with monitor.stage("start"):
                 frame, missing = _start(state, heard, metres, view, config)
@@ -148,6 +155,9 @@ def _hear(bus: Bus) -> Iterator[_Heard]:
         heard = (replace(h, update=update) for h, update in join(heard, updates))
         keyframes = receive(bus, topics.KEYFRAME, Keyframe)
         heard = (replace(h, keyframe=keyframe) for h, keyframe in join(heard, keyframes))
+    if bus.reads(topics.MAP_DEFORMING):
+        deforming = receive(bus, topics.MAP_DEFORMING, DeformingLandmarks)
+        heard = (replace(h, deforming=found) for h, found in join(heard, deforming))
     return heard
 
 
@@ -163,12 +173,21 @@ def _prediction(state: _State, heard: _Heard) -> F64 | None:
 
 
 def _look_at_map(state: _State, heard: _Heard, config: Config) -> MapView | None:
-    """The state of Pliant's own map in this frame, with or without pixels."""
+    """What Pliant's own map knows of this frame, with or without pixels.
+
+    While the scene deforms a rigid map is wrong: that of the last seconds counts.
+    """
     if state.map_depth is None or heard.update is None or heard.keyframe is None:
         return None
     p = config.surfels
     max_sigma = p.map_birth_sigma if state.started else p.map_sigma
-    return state.map_depth.take(heard.update, heard.keyframe, heard.frame, max_sigma=max_sigma)
+    view = state.map_depth.take(heard.update, heard.keyframe, heard.frame, max_sigma=max_sigma)
+    if heard.deforming is None:
+        return view
+    found = state.follower.take(heard.deforming)
+    if found is not None:
+        return view_of_window(found, state.stream.camera, heard.update.segment)
+    return None if state.follower.deforms else view
 
 
 def _start(
@@ -186,26 +205,32 @@ def _start(
     if metres is None:
         return SurfelFrame.empty(), missing
     frame = state.tracker.start(image, metres, state.stream.camera, T_world_camera)
+    if frame.lost:
+        return SurfelFrame.empty(), f"{WAITING_FOR_DEPTH} where there is texture"
     state.started = True
     return frame, ""
 
 
 def _add(
-    state: _State, image: U8, frame: SurfelFrame, view: MapView, config: Config
+    state: _State, image: Image, frame: SurfelFrame, view: MapView, config: Config
 ) -> tuple[SurfelFrame, str]:
     """Create surfels on a later keyframe of our own map; otherwise return the reason why not."""
-    if not frame.lost:
-        found = agree(view.depth, frame, config.surfels.patch_px)
-        if found.depth is None:
-            return frame, f"no surfels are created on the map: {found.problem}"
-        state.ratio, state.segment = found.ratio, view.segment
-        return state.tracker.add(image, found.depth), ""
-    # No surfels are left to compare with.  For the same map the last ratio holds.
-    if view.segment != state.segment:
-        state.ratio, state.segment = 1.0, view.segment
-    T_world_camera = view.T_world_camera.copy()
-    T_world_camera[:3, 3] *= state.ratio
-    return state.tracker.add(image, state.ratio * view.depth, T_world_camera), ""
+    if frame.lost:
+        # No surfels are left to compare with.  For the same map the last ratio holds.
+        if view.segment != state.segment:
+            state.ratio, state.segment = 1.0, view.segment
+        T_world_camera = view.T_world_camera.copy()
+        T_world_camera[:3, 3] *= state.ratio
+        return state.tracker.add(image.grey, state.ratio * view.depth, T_world_camera), ""
+    state.segment = view.segment
+    if state.follower.deforms:
+        state.ratio = state.follower.place(state.tracker, frame, state.ratio)
+        return state.tracker.add(image.grey, state.ratio * view.depth), ""
+    found = agree(view.depth, frame, config.surfels.patch_px)
+    if found.depth is None:
+        return frame, f"no surfels are created on the map: {found.problem}"
+    state.ratio = found.ratio
+    return state.tracker.add(image.grey, found.depth), ""
 
 
 def warm_up() -> None:

@@ -55,6 +55,7 @@ from pliant_services.run.resume import (
 from pliant_services.run.spectators import Viewer, check_viewer, has_viewer
 from pliant_services.runtime import kernels as warm_up
 from pliant_services.runtime.announced import announced
+from pliant_services.runtime.fork_server import ForkServer
 from pliant_services.runtime.launcher import Fleet, ServiceDiedError
 from pliant_services.runtime.limits import check_limits
 
@@ -62,8 +63,10 @@ _DEFORMABLE = "deformable"
 _WRITTEN_AGAIN = "the run was already complete: its results are written again"
 
 
-def run_pipeline(request: RunRequest) -> int:
+def run_pipeline(request: RunRequest, server: ForkServer | None = None) -> int:
     """Run the pipeline; returns the exit code.  Raises PliantError for what the user can mend.
+
+    server: forks the services, and imports what they need while this process checks the source.
 
     Everything is checked before an earlier result is touched.
     """
@@ -96,7 +99,7 @@ def run_pipeline(request: RunRequest) -> int:
                 print(_WRITTEN_AGAIN, file=sys.stderr, flush=True)
                 code = _finish(output, interrupted=False, failure=None, resumed=True)
             else:
-                code = _run_into(output, request, viewer, held)
+                code = _run_into(output, request, viewer, held, server)
             if request.quality == "high" and code != INTERRUPTED and held.path is not None:
                 from pliant_services.run.second_pass import second_pass  # it maps in this process
 
@@ -106,7 +109,13 @@ def run_pipeline(request: RunRequest) -> int:
         return code
 
 
-def _run_into(output: Path, request: RunRequest, viewer: Viewer | None, held: Held) -> int:
+def _run_into(
+    output: Path,
+    request: RunRequest,
+    viewer: Viewer | None,
+    held: Held,
+    server: ForkServer | None,
+) -> int:
     config = load_config(request.config_file, request.overrides, seed=request.seed)
     profile = request.profile
     state = output / STATE_FOLDER if request.on_crash == "restart" or request.resume else None
@@ -157,6 +166,7 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None, held: He
             on_status=_Followed(output, progress).on_status,
             port=request.port,
             state=state,
+            server=server,
         )
         interrupted, failure = _go_through(request, config, output, fleet, progress, viewer)
         output = _where_now(output, held, failure, progress)

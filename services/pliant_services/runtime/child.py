@@ -12,6 +12,7 @@ from pathlib import Path
 
 from pliant.exit_codes import DONE, INCOMPLETE
 from pliant.files import append
+from pliant_services.runtime.fork_server import ForkedProcess
 
 _LAST_WORDS = 12  # lines of a service's log that are shown when it dies
 _POLL_S = 0.05
@@ -24,7 +25,7 @@ class Child:
     that is full."""
 
     name: str
-    process: subprocess.Popen[bytes]
+    process: subprocess.Popen[bytes] | ForkedProcess
     log: Path
     lines: deque[str] = field(default_factory=lambda: deque[str](maxlen=_LAST_WORDS))
 

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -83,8 +84,7 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
     open_session(
         options.endpoints, options.identity
     ).close()  # said now, not after a minute of compiling
-    if process.kernels:
-        module.warm_up()
+    load_kernels(name)
     gc.freeze()
     gc.set_threshold(*collected_after)
     os.nice(process.niceness)
@@ -135,6 +135,14 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
         bus.see_off()
     if lost is not None:
         raise lost
+
+
+@cache
+def load_kernels(name: str) -> None:
+    """Load the compiled kernels of a service, or compile them; a fork of this process has them."""
+    process = processes.BY_NAME[name]
+    if process.kernels:
+        importlib.import_module(process.module).warm_up()
 
 
 def _keep_freed_memory() -> None:

@@ -27,6 +27,7 @@ from pliant.messages.topics import Topic
 from pliant.messages.types import Status
 from pliant_services.processes import BY_NAME
 from pliant_services.runtime.child import Child, first_to_fail
+from pliant_services.runtime.fork_server import ForkServer
 from pliant_services.runtime.relay import Relay
 
 READY_TIMEOUT_S = 120.0
@@ -57,9 +58,11 @@ class Fleet:
         on_status: Callable[[Status], None],
         port: int | None = None,
         state: Path | None = None,
+        server: ForkServer | None = None,
     ) -> None:
         """Start the router.  ``port``: of it on loopback; else it is at a Unix socket where that
         works.  ``state``: folder of checkpoints; with it, services that die are started again.
+        ``server``: forks the services, and may have been started earlier.
         Raises BusError when the port is in use."""
         self._services = tuple(services)
         self._log_folder = log_folder
@@ -72,6 +75,7 @@ class Fleet:
         self.session = f"run-{os.getpid()}"
         self._local = LocalRouter(port)
         self.endpoint, self.note = self._local.endpoint, self._local.note
+        self._server = server or ForkServer(services)
         self._router = self._local.session
         self._relay = Relay(self._router, self.session)
         self._ready: set[str] = set()
@@ -107,8 +111,10 @@ class Fleet:
         self._arguments = arguments
         for name in self._services:
             (self._log_folder / f"{name}.log").unlink(missing_ok=True)
+        self._server.load(self._services)
         for name in reversed(self._services):
             self._children.append(self._spawn(name))  # one by one: a Ctrl-C leaves none behind
+        self._server.close()
         deadline = time.monotonic() + READY_TIMEOUT_S
         while not self._ready >= set(self._services):
             self._all_left()  # who dies now is started again, too
@@ -180,6 +186,7 @@ class Fleet:
         Takes no more than that long, and cannot be interrupted: nothing may be left behind.
         """
         with _uninterrupted():
+            self._server.close()
             running = [child for child in self._children if child.process.poll() is None]
             for child in running:
                 child.process.send_signal(signal.SIGINT)
@@ -198,15 +205,14 @@ class Fleet:
 
     def _spawn(self, name: str) -> Child:
         patience = [] if self._state is not None else ["--patience", "0"]  # who dies is not awaited
-        command = [
-            *(sys.executable, "-m", "pliant_services.cli", "service", name),
-            *("--connect", self.endpoint, "--session", self.session),
+        arguments = [
+            *("service", name, "--connect", self.endpoint, "--session", self.session),
             *("--fleet", ",".join(self._services), "--with-launcher", *patience),
             *(("--state", str(self._state)) if self._state is not None else ()),
             *self._arguments(name),
         ]
-        process = subprocess.Popen(
-            command,
+        process = self._server.start(arguments) or subprocess.Popen(
+            [sys.executable, "-m", "pliant_services.cli", *arguments],
             stdin=subprocess.PIPE,  # never written: it closes when the launcher is gone
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

@@ -1,8 +1,8 @@
-"""How images cross a link between machines (``bus.link_images``), and the reader's side of it.
+"""How images are sent (``bus.link_images``), and the reader's side of it.
 
-raw: as they are.     lossless: packed, the same pixels; of a camera that gives JPEGs those
-themselves.     jpeg: the source's images become JPEGs before anything else sees them, so that what
-is recorded is what was worked on.
+raw: grey as it is; of a JPEG the colours stay in it, which few frames need.     lossless: packed,
+the same pixels; of a camera that gives JPEGs those themselves.     jpeg: the source's images become
+JPEGs before anything else sees them, so that what is recorded is what was worked on.
 
 Of a JPEG every reader makes the rectified image itself, as a replay does: it is a tenth of the
 pixels.
@@ -53,27 +53,33 @@ class Sender:
 
     def image(self, image: Image, frame: SourceFrame) -> Image:
         """The message that crosses."""
-        if self._how == "raw" or image.missing or frame.encoding != "jpeg":
+        is_raw = self._how == "raw"
+        if image.missing or frame.encoding != "jpeg" or (is_raw and not image.colour.size):
             return image
-        colour = image.colour[:0, :0]
         return replace(
-            image, grey=_NO_PIXELS, colour=colour, jpeg=frame.data, calibration=self._calibration
+            image,
+            grey=image.grey if is_raw else _NO_PIXELS,
+            colour=image.colour[:0, :0],
+            jpeg=frame.data,
+            calibration=self._calibration,
         )
 
 
 def receive_images(bus: Bus, *, mapped_only: bool = False) -> Iterator[Image]:
-    """Every ``camera/image`` with its pixels, in whatever form it was sent.
+    """Every ``camera/image`` with its grey pixels, in whatever form it was sent.
 
     mapped_only: images that bundle adjustment skips stay as sent, perhaps without pixels.
     Raises MessageError for one that no sender of ours makes.
     """
     for image in receive(bus, topics.IMAGE, Image):
         unused = mapped_only and image.unmapped
-        yield whole(image) if image.jpeg and not unused else image
+        yield image if image.grey.size or unused else whole(image)
 
 
 def whole(image: Image) -> Image:
-    """The image that a JPEG gives.  Raises MessageError if it gives none."""
+    """The image with colours, too.  Raises MessageError if its JPEG gives none."""
+    if not image.jpeg:
+        return image
     where = f"{topics.IMAGE.key}: frame {image.frame}"
     try:
         calibration, rectifier = _rectifier(image.calibration)

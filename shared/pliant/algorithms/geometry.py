@@ -18,6 +18,12 @@ def hat(vectors: F64) -> F64:
     return out
 
 
+def lengths(vectors: F64) -> F64:
+    """(N,) of (N, 3) vectors: the bytes of ``np.linalg.norm`` in less than half its time."""
+    x, y, z = vectors.T
+    return np.sqrt(x * x + y * y + z * z)
+
+
 def so3_exp(rotation_vectors: F64) -> F64:
     """(..., 3) rotation vectors in radians to (..., 3, 3) rotation matrices (Rodrigues)."""
     angle = np.linalg.norm(rotation_vectors, axis=-1)[..., None, None]

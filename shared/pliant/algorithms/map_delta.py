@@ -36,7 +36,7 @@ class MapMoves:
     def matrices(self, keyframes: I64) -> F64:
         """(N, 4, 4) the similarity of each of the keyframes (N,), by id."""
         table = np.concatenate([np.eye(4)[None], similarity_to_matrix(self.moves)])
-        return table[np.searchsorted(self.keyframe_ids, keyframes, side="right")]
+        return table.take(np.searchsorted(self.keyframe_ids, keyframes, side="right"), 0)
 
     def then(self, moves: "MapMoves") -> "MapMoves":
         """Both as one, these first."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pliant.messages.types import (
     CameraStream,
     ClipPiece,
+    DeformingLandmarks,
     Depth,
     Extrema,
     GpsPiece,
@@ -84,6 +85,7 @@ MAP_KEPT = Topic("map/kept", MapKeyframe, per_frame=False, max_bytes=64 * _MIB)
 MESH_BLOCKS = Topic("mesh/blocks", MeshUpdate, per_frame=False, max_bytes=256 * _MIB, viewed=64)
 MESH_FINAL = Topic("mesh/final", MeshPiece, per_frame=False, viewed=64)
 SURFELS = Topic("surfels/state", Surfels, per_frame=True, max_bytes=64 * _MIB, viewed=2)
+MAP_DEFORMING = Topic("map/deforming", DeformingLandmarks, per_frame=True)
 STREAM_END = Topic("stream/end", StreamEnd, per_frame=False, max_bytes=_MIB)
 
 
@@ -94,7 +96,8 @@ def status(service: str) -> Topic:
 
 TOPICS = (
     STREAM, CLIP, SOURCE, IMAGE, DEPTH, IMU, GPS, MAP_KNOWN, EXTREMA, MAP_UPDATE, MAP_FINAL,
-    KEYFRAME, KEYFRAME_FINAL, MAP_KEPT, MESH_BLOCKS, MESH_FINAL, SURFELS, STREAM_END,
+    KEYFRAME, KEYFRAME_FINAL, MAP_KEPT, MESH_BLOCKS, MESH_FINAL, MAP_DEFORMING, SURFELS,
+    STREAM_END,
 )  # fmt: skip
 WITH_PIXELS = (IMAGE, SOURCE)
 """Topics that are compressed for a link between machines."""

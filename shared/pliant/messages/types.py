@@ -9,6 +9,7 @@ from typing import Annotated, Any, TypeVar
 
 from pliant.algorithms.arrays import F32, F64, I32, U8, Shape
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.deformable.moving_landmarks import WindowMap
 from pliant.algorithms.inertial.samples import GpsFixes, ImuSamples
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.meshing.mesh_blocks import MeshBlocks, no_rows
@@ -178,8 +179,8 @@ class Image(Header):
 
     grey: (H, W).     colour: (H, W, 3) RGB, or (0, 0, 3) where the source has none.
     missing: "" or why there are no pixels ("dropped", "broken: ..."); both arrays are empty then.
-    jpeg, calibration: over a link, instead of pixels, what they are made from: the source's JPEG
-    and its camera as YAML; ``pliant_services.runtime.link_images`` makes them.
+    jpeg, calibration: instead of colours, and over a link of all pixels, what they are made from:
+    the source's JPEG and its camera as YAML; ``pliant_services.runtime.link_images`` makes them.
     unmapped: bundle adjustment only localises this frame, by its tracks, as it is behind (live
     mode).   unplaced: it is so far behind that it does not do that either.
     mask: which pixels are used, as of ``pliant.algorithms.image.masks``; b"": all of them.
@@ -278,6 +279,11 @@ class MeshPiece(Header):
     colours: Annotated[U8, Shape("V", 3)]
     triangles: Annotated[I32, Shape("T", 3)]
     closed: Annotated[I32, Shape("C")] = field(default_factory=no_rows)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeformingLandmarks(Header, WindowMap):
+    """The map of the last seconds of a scene that deforms; most frames have none."""
 
 
 @dataclass(frozen=True, kw_only=True)

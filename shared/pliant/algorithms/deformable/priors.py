@@ -9,7 +9,7 @@ _GRADIENT = 0.3
 """Standard deviation of the difference of two joined displacements, by the nodes' distance."""
 _STRAIN = 0.02
 """The same, of the change of their distance."""
-_SIZE = 0.003
+STIFF = 0.003
 """Displacement that a stiff node may have, as a share of the median depth."""
 
 
@@ -26,9 +26,9 @@ class Prior:
 
     def update_rigidity(self, d: F64) -> None:
         """Weights of the Geman-McClure cost of each node's displacements (K, N, 3) as they are."""
-        share = (d**2).sum(axis=2).mean(axis=0) / _SIZE**2
+        share = (d**2).sum(axis=2).mean(axis=0) / STIFF**2
         rigidity = (1.0 + share) ** -2.0
-        self.matrix = self._edges + np.diag(np.repeat(rigidity / _SIZE**2, 3))
+        self.matrix = self._edges + np.diag(np.repeat(rigidity / STIFF**2, 3))
 
     def gradient(self, d: F64) -> F64:
         """P d for (K, N, 3) displacements."""

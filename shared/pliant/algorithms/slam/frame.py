@@ -1,5 +1,6 @@
 """A frame in the mapper: from tracking, in ideal pixels, and with its pose."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -19,14 +20,24 @@ from pliant.algorithms.tracks import FrameExtrema, FrameTracks
 class Frame:
     """The output of ingest and tracking, in pixels of the rectified image.
 
-    stamp_ns: capture time, increasing.   grey: (H, W).   colour: (H, W, 3) RGB.
+    stamp_ns: capture time, increasing.   grey: (H, W).
+    colour: (H, W, 3) RGB, or what makes it of the few frames that need it.
     """
 
     number: int
     stamp_ns: int
     extrema: FrameExtrema
     grey: U8 | None = None
-    colour: U8 | None = None
+    colour: U8 | Callable[[], U8 | None] | None = None
+
+    def coloured(self) -> "Frame":
+        """Return the frame with its colours made."""
+        return replace(self, colour=self.colour()) if callable(self.colour) else self
+
+    def pixels(self) -> U8 | None:
+        """The colour image, or otherwise the grey one."""
+        colour = self.colour() if callable(self.colour) else self.colour
+        return self.grey if colour is None else colour
 
     @staticmethod
     def of_tracks(number: int, stamp_ns: int, tracks: FrameTracks) -> "Frame":
@@ -87,8 +98,7 @@ class IdealFrame:
     @property
     def colours(self) -> MovedImage | None:
         """The colour image, or otherwise the grey one, in the tracks' pixels."""
-        given = self.given
-        pixels = given.grey if given.colour is None else given.colour
+        pixels = self.given.pixels()
         return None if pixels is None else self._moved(pixels)
 
     def _moved(self, pixels: U8) -> MovedImage:

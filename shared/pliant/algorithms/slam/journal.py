@@ -158,8 +158,8 @@ class Journal:
             point_ids=points.ids[rows],
             point_segments=points.segment[rows],
             # float32 is far below the uncertainty; files and viewers have it, too.
-            points_world=points.xyz[rows].astype(np.float32).astype(np.float64),
-            point_colours=points.colours[rows],
+            points_world=points.xyz.take(rows, 0).astype(np.float32).astype(np.float64),
+            point_colours=points.colours.take(rows, 0),
             point_keyframes=points.keyframes[rows],
             point_parallax_rad=with_bits(points.parallax_rad[rows], _BITS),
             point_sigmas=with_bits(points.sigmas[rows], _BITS),
@@ -188,8 +188,8 @@ class Journal:
             self._poses = np.append(self._poses, np.full((more, 4, 4), np.nan), axis=0)
 
     def _is_current(self, rows: I32) -> BoolArray:
-        same = self._ids[rows] == self._points.ids[rows]
-        return same & (self._hosts[rows] == self._points.first_keyframe[rows])
+        same = self._ids.take(rows) == self._points.ids.take(rows)
+        return same & (self._hosts.take(rows) == self._points.first_keyframe.take(rows))
 
     def _changed_keyframes(self, snapshot: bool) -> list[Keyframe]:
         """Return the keyframes to publish, and record them as published."""
@@ -220,7 +220,7 @@ class Journal:
             point_ids = self._points.ids[keyframe.rows[mapped]]
             order = np.argsort(point_ids)
             ids.append(point_ids[order])
-            points_px = (keyframe.points_px + keyframe.rolled_px)[mapped[order]]
+            points_px = (keyframe.points_px + keyframe.rolled_px).take(mapped[order], 0)
             pixels.append(known.view_at(keyframe.log_focal).seen(points_px))
         return KeyframeDelta(
             new=new,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, U8, BoolArray
+from pliant.algorithms.arrays import F64, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.slam.places.place_index import Features, describe
@@ -147,6 +147,23 @@ class SurfelTracker:
         self._give_birth(self._pyramid(image), _checked_depth(depth, self._camera))
         self._remember(image)
         return self._result()
+
+    def place(self, T_world_camera: F64) -> SurfelFrame:
+        """Correct the camera's pose (4, 4): the world moves with it, and no pixel changes."""
+        table, T = self._table, T_world_camera @ inverse(self._T_world_camera)
+        table.poses, table.guesses = move_poses(table.poses, T), move_poses(table.guesses, T)
+        table.tried, table.rest = transform(T, table.tried), transform(T, table.rest)
+        self._T_world_camera = T_world_camera.copy()
+        return self._result()
+
+    def settle(self, rows: I64, rest: F64, sigmas: F64) -> None:
+        """Change where surfels rest (R, 3), world, and how far they move from there (R,): Eq. 20.
+
+        rows: of the last result.
+        """
+        table = self._table
+        table.rest, table.sigmas = table.rest.copy(), table.sigmas.copy()
+        table.rest[rows], table.sigmas[rows] = rest, sigmas
 
     def _pyramid(self, image: U8) -> list[Level]:
         camera, p = self._camera, self._parameters

@@ -6,6 +6,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera, size_unit
+from pliant.algorithms.geometry import lengths
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.slam.adjust.loops import Loop
 from pliant.algorithms.slam.adjust.segment import InertialSource, Segment
@@ -152,9 +153,9 @@ class ActiveMap:
 
     def judge_tracks(self, tracks: I64, errors: F32) -> None:
         """Take tracks from points that they missed in several frames in a row."""
-        rows = self.links.rows[tracks]
+        rows = self.links.rows.take(tracks)
         bad = errors > 2.0 * self.parameters.localisation.inlier_px
-        strikes = np.where(bad, self.points.strikes[rows] + 1, 0).astype(np.uint8)
+        strikes = np.where(bad, self.points.strikes.take(rows) + 1, 0).astype(np.uint8)
         self.points.strikes[rows] = strikes
         lost = strikes >= _MAX_STRIKES
         self.points.strikes[rows[lost]] = 0
@@ -185,7 +186,7 @@ class ActiveMap:
         self.links.rows[track[taken]] = new[taken]
         taken &= former != UNLINKED
         self.points.merge(former[taken], new[taken])
-        points_px = reacquired.points_px[alone]
+        points_px = reacquired.points_px.compress(alone, 0)
         return Observations(
             rows=reacquired.rows[alone], points_px=points_px, rolled_px=np.zeros_like(points_px)
         )
@@ -193,8 +194,8 @@ class ActiveMap:
     def _same_depth(self, a: I32, b: I32) -> BoolArray:
         """Whether points that lie on nearly the same ray are as far from the newest keyframe."""
         centre = self.keyframes[-1].T_world_camera[:3, 3]
-        distance_a = np.linalg.norm(self.points.xyz[a] - centre, axis=1)
-        distance_b = np.linalg.norm(self.points.xyz[b] - centre, axis=1)
+        distance_a = lengths(self.points.xyz.take(a, 0) - centre)
+        distance_b = lengths(self.points.xyz.take(b, 0) - centre)
         return np.abs(distance_a - distance_b) < _SAME_DEPTH_SHARE * distance_b
 
     def helping_candidates(self) -> I64:
@@ -237,8 +238,8 @@ class ActiveMap:
 
     def _observed(self, placed: PlacedFrame, tracks: I64) -> tuple[I32, F32]:
         found, points_px = placed.found, placed.frame.tracks.points_px
-        rows = np.concatenate([self.links.rows[tracks], found.rows])
-        return rows, np.concatenate([points_px[tracks], found.points_px])
+        rows = np.concatenate([self.links.rows.take(tracks), found.rows])
+        return rows, np.concatenate([points_px.take(tracks, 0), found.points_px])
 
     def join(self, loop: Loop) -> None:
         """Merge the landmarks that a loop has shown to be the same, if they still exist."""
@@ -259,7 +260,7 @@ class ActiveMap:
         frame, found = placed.frame, placed.found
         points_px = frame.tracks.points_px
         new = self._link_new_tracks()
-        self._paint(self.links.rows[new], points_px[new], frame)
+        self._paint(self.links.rows.take(new), points_px.take(new, 0), frame)
         keyframe = self._append_keyframe(
             frame.number,
             frame.stamp_ns,
@@ -281,7 +282,7 @@ class ActiveMap:
         self._place_candidates()
         if frame.has_image:
             mapped = self.points.state[newest.rows] == MAPPED
-            rows, points_px = newest.rows[mapped], newest.points_px[mapped]
+            rows, points_px = newest.rows.compress(mapped), newest.points_px.compress(mapped, 0)
             cut_patches(frame.image, points_px, rows, self.points.patches)
             self.points.patch_keyframe[rows] = newest.id
 
@@ -322,10 +323,10 @@ class ActiveMap:
             segment=self.segment.id,
             T_world_camera=T_world_camera.copy(),
             rows=rows,
-            points_px=points_px[first],
+            points_px=points_px.take(first, 0),
             rolled_px=np.zeros((len(first), 2), np.float32)
             if rolled_px is None
-            else rolled_px[first],
+            else rolled_px.take(first, 0),
         )
         self.next_keyframe_id += 1
         self.keyframes.append(keyframe)

@@ -48,14 +48,14 @@ def refocused(
     every = thinning(len(linked))
     linked = linked[::every]
     rows, predicted = active.links.rows[linked], motion.predictions(stamp_ns)[0]
-    points_px = calibration.frame_view.pixels(tracks.points_px[linked])
+    points_px = calibration.frame_view.pixels(tracks.points_px.take(linked, 0))
     if calibration.readout:
         rolled = active.segment.rolled(calibration, motion.velocity)
         depths = active.segment.inverse_depths(rows, predicted)
         points_px = rolled.removed(points_px, depths)
     given = calibration.given
     change, sigma = refine_focal(
-        predicted, active.points.xyz[rows], points_px, active.camera, (given.cx, given.cy),
+        predicted, active.points.xyz.take(rows, 0), points_px, active.camera, (given.cx, given.cy),
         RATE * np.sqrt(max(motion.lost_s(stamp_ns), _LEAST_GAP_S)) if changes else SPREAD,
         every,
     )  # fmt: skip

@@ -127,7 +127,7 @@ def localise(
     linked = np.concatenate([active.linked(MAPPED), candidates])
     limits = parameters.localisation
     if len(linked) >= limits.min_inliers:
-        rows, points_px = active.links.rows[linked], tracks.points_px[linked]
+        rows, points_px = active.links.rows.take(linked), tracks.points_px.take(linked, 0)
         if frame.calibration.readout:
             rolled = active.segment.rolled(frame.calibration, motion.velocity)
             depths = active.segment.inverse_depths(rows, predictions[0])
@@ -216,7 +216,7 @@ def reacquire_points(
         found = Observations(rows=found.rows, points_px=points_px, rolled_px=rolled_px)
     placed = refine_by_all(active, replace(placed, found=found))
     linked = active.linked(MAPPED)
-    points.kappas[active.links.rows[linked]] = tracks.kappas[linked]
+    points.kappas[active.links.rows.take(linked)] = tracks.kappas.take(linked)
     return placed
 
 
@@ -236,7 +236,9 @@ def rotation_by_image(active: ActiveMap, placed: PlacedFrame) -> tuple[F64, floa
     candidates = active.helping_candidates()
     rows, points_px = active.observed(placed, candidates)
     some = np.arange(0, len(rows), max(1, len(rows) // _DECIDING))
-    seen = _correspondences(active, NO_PRIOR, rows[some], points_px[some], len(candidates))
+    seen = _correspondences(
+        active, NO_PRIOR, rows.take(some), points_px.take(some, 0), len(candidates)
+    )
     bundle = BundleParameters(kernel_sigma_px=KERNEL_SIGMA_PX)
     found = refine_pose(placed.T_world_camera, seen, active.camera, bundle)
     H = found.information
@@ -264,8 +266,8 @@ def judge_tracks(active: ActiveMap, placed: PlacedFrame) -> None:
 def _track_errors(active: ActiveMap, placed: PlacedFrame) -> tuple[I64, F32]:
     """Indices of the tracks of landmarks, and their reprojection errors in px."""
     linked = active.linked(MAPPED)
-    xyz = active.points.xyz[active.links.rows[linked]]
-    points_px = placed.frame.tracks.points_px[linked]
+    xyz = active.points.xyz.take(active.links.rows.take(linked), 0)
+    points_px = placed.frame.tracks.points_px.take(linked, 0)
     return linked, reprojection_errors(placed.T_world_camera, xyz, points_px, active.camera)
 
 
@@ -274,14 +276,15 @@ def supported(active: ActiveMap, motion: Motion, placed: PlacedFrame) -> PlacedF
     tracks = placed.frame.tracks
     settled = _settled(active, motion, tracks)
     settled[_contradicting(active, placed.T_world_camera, tracks.points_px)] = True
-    return with_support(active, placed, tracks.points_px[settled])
+    return with_support(active, placed, tracks.points_px.compress(settled, 0))
 
 
 def with_support(active: ActiveMap, placed: PlacedFrame, settled_px: F32) -> PlacedFrame:
     """Return the frame with its support.   settled_px: (N, 2) of tracks that should support it."""
     T_world_camera = placed.T_world_camera
     rows, points_px = active.observed(placed, active.helping_candidates())
-    errors = reprojection_errors(T_world_camera, active.points.xyz[rows], points_px, active.camera)
+    xyz = active.points.xyz.take(rows, 0)
+    errors = reprojection_errors(T_world_camera, xyz, points_px, active.camera)
     inliers = errors < active.parameters.localisation.inlier_px
     tracked = len(rows) - len(placed.found.rows)
     support = support_of(points_px, inliers, tracked, settled_px, active.camera)
@@ -299,7 +302,7 @@ def _settled(active: ActiveMap, motion: Motion, tracks: FrameTracks) -> BoolArra
     points, parameters = active.points, active.parameters
     rows = active.links.rows
     newest = active.keyframes[-1].id
-    seen_by = np.where(rows != UNLINKED, newest + 1 - points.first_keyframe[rows], 0)
+    seen_by = np.where(rows != UNLINKED, newest + 1 - points.first_keyframe.take(rows), 0)
     old = tracks.ages * motion.interval_s() >= SETTLED_S
     return old & (seen_by >= parameters.point.min_observations)
 
@@ -308,10 +311,11 @@ def _contradicting(active: ActiveMap, T_world_camera: F64, points_px: F32) -> I6
     """Indices of the tracks of candidates that no depth makes consistent with the pose."""
     points = active.points
     candidates = placed_candidates(points, active.links.rows)
-    rows = active.links.rows[candidates]
+    rows = active.links.rows.take(candidates)
     off = off_epipolar_line(
-        T_world_camera, points.xyz[rows], points.spread[rows], points_px[candidates], active.camera
-    )
+        T_world_camera, points.xyz.take(rows, 0), points.spread.take(rows, 0),
+        points_px.take(candidates, 0), active.camera,
+    )  # fmt: skip
     return candidates[off > _OFF * active.parameters.localisation.inlier_px]
 
 
@@ -325,7 +329,9 @@ def check_pure_rotation(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
     T_standing = placed.T_world_camera
     for every in (max(1, len(rows) // _DECIDING), 1):  # a few tracks reveal most motions
         some = np.arange(0, len(rows), every)
-        seen = _correspondences(active, placed.prior, rows[some], points_px[some], len(rows))
+        seen = _correspondences(
+            active, placed.prior, rows.take(some), points_px.take(some, 0), len(rows)
+        )
         located = refine(
             placed.T_world_camera, seen, active.camera, parameters.localisation, near=True
         )
@@ -340,7 +346,7 @@ def _correspondences(
 ) -> Correspondences:
     """Rows (N,) at points_px (N, 2).   candidates: how many of the rows are provisional."""
     spread = spread_of(active.points, rows, active.keyframes[-1]) if candidates else None
-    return Correspondences(active.points.xyz[rows], points_px, spread=spread, prior=prior)
+    return Correspondences(active.points.xyz.take(rows, 0), points_px, spread=spread, prior=prior)
 
 
 def limits_of_points(inliers: int, parameters: MappingParameters) -> PointParameters:

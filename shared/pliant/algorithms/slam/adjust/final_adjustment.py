@@ -89,10 +89,10 @@ class ObservationList:
         return replace(
             self,
             rows=self.rows[chosen],
-            xyz=self.xyz[chosen],
+            xyz=self.xyz.compress(chosen, 0),
             camera=self.camera[kept],
             point=number[self.point[kept]],
-            px=self.px[kept],
+            px=self.px.compress(kept, 0),
             weights=self.weights[kept],
             flow=None if self.flow is None else self.flow[kept],
         )
@@ -289,7 +289,7 @@ def list_observations(
     mapped = [points.state[keyframe.rows] == MAPPED for keyframe in keyframes]
     pairs = list(zip(keyframes, mapped, strict=True))
     listed = [k.rows[each] for k, each in pairs]
-    px = np.concatenate([(k.points_px + k.rolled_px)[each] for k, each in pairs])
+    px = np.concatenate([(k.points_px + k.rolled_px).compress(each, 0) for k, each in pairs])
     sizes = np.array([len(rows) for rows in listed])
     seen = np.concatenate(listed)
     number = np.zeros(len(points.state), np.int32)
@@ -301,7 +301,7 @@ def list_observations(
     number[rows] = np.arange(len(rows), dtype=np.int32)
     return ObservationList(
         rows=rows,
-        xyz=points.xyz[rows],
+        xyz=points.xyz.take(rows, 0),
         T_world_camera=np.array([keyframe.T_world_camera for keyframe in keyframes]),
         camera=np.repeat(np.arange(len(keyframes), dtype=np.int32), sizes),
         point=number[seen],
@@ -339,10 +339,10 @@ def _problem(
     M = len(seen.T_world_camera)
     return BundleProblem(
         T_world_camera=seen.T_world_camera,
-        points_world=seen.xyz[chosen],
+        points_world=seen.xyz.compress(chosen, 0),
         camera_index=seen.camera[kept],
         point_index=number[seen.point[kept]].astype(np.int32),
-        points_px=seen.px[kept],
+        points_px=seen.px.compress(kept, 0),
         intrinsics=shared_intrinsics(camera, M),
         fixed_cameras=seen.fixed,
         weights=seen.weights[kept],

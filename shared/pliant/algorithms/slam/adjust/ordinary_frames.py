@@ -178,7 +178,8 @@ def refined_poses(
         still &= points.state[each.rows] == MAPPED
         if still.sum() < max(limits.min_inliers, MAPPED_SHARE * len(still)):
             continue
-        points_px, xyz = each.points_px[still], points.xyz[each.rows[still]]
+        points_px = each.points_px.compress(still, 0)
+        xyz = points.xyz.take(each.rows.compress(still), 0)
         start = keyframe.T_world_camera @ each.T_keyframe_camera
         if seen_by.changes:
             centre = seen_by.given.cx, seen_by.given.cy
@@ -219,11 +220,11 @@ def smoothed_poses(
         if not path.has(keyframe.frame, keyframe):
             continue
         here = points.state[keyframe.rows] == MAPPED
-        points_px = keyframe.points_px[here]
+        points_px = keyframe.points_px.compress(here, 0)
         weights = seen_by.weights(points_px)
         found = refine_pose(
             keyframe.T_world_camera,
-            Correspondences(points.xyz[keyframe.rows[here]], points_px, weights),
+            Correspondences(points.xyz.take(keyframe.rows[here], 0), points_px, weights),
             seen_by.view.camera, parameters.bundle, inlier_px=parameters.localisation.inlier_px,
             iterations=1,
         )  # fmt: skip

@@ -407,14 +407,17 @@ def bend(
     # The reference of a dropped keyframe's landmarks is the keyframe before it.
     slots = np.maximum(np.searchsorted(ids, points.first_keyframe[rows], side="right") - 1, 0)
     T_world_keyframe = np.array([keyframe.T_world_camera for keyframe in keyframes])
-    T_world_host, T_host_world = T_world_keyframe[slots], inverse(T_world_keyframe)[slots]
-    in_host = _each(T_host_world, points.xyz[rows])
+    T_world_host, T_host_world = (
+        T_world_keyframe.take(slots, 0),
+        inverse(T_world_keyframe).take(slots, 0),
+    )
+    in_host = _each(T_host_world, points.xyz.take(rows, 0))
     ahead = in_host[:, 2] > _MIN_DEPTH
-    rows, in_host = rows[ahead], in_host[ahead]
+    rows, in_host = rows.compress(ahead), in_host.compress(ahead, 0)
     px = before.camera.project(in_host).astype(np.float32)
     px = moved_px(px, before, after, None if refocus is None else refocus[slots[ahead]])
     in_host[:, :2] = after.camera.normalise(px) * in_host[:, 2:]
-    points.move_to(rows, _each(T_world_host[ahead], in_host))
+    points.move_to(rows, _each(T_world_host.compress(ahead, 0), in_host))
 
 
 def _each(T: F64, points: F64) -> F64:

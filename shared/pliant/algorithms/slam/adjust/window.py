@@ -3,7 +3,7 @@
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, BoolArray
-from pliant.algorithms.geometry import inverse, move_by_similarity
+from pliant.algorithms.geometry import inverse, lengths, move_by_similarity
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.estimate.observation_table import (
     columns_in_state,
@@ -145,10 +145,10 @@ class Window:
         mapped = self.rows[self.mapped_columns()]
         if len(mapped):
             centre = self.keyframes[-1].T_world_camera[:3, 3]
-            distance = np.linalg.norm(self.points.xyz[mapped] - centre, axis=1)
+            distance = lengths(self.points.xyz.take(mapped, 0) - centre)
             inverse_distance = float(np.median(1.0 / distance))
         columns = columns_in_state(self.rows, self.points.state, CANDIDATE)
-        rows = self.rows[columns]
+        rows = self.rows.take(columns)
         xyz, spread = place(
             self.T_world_camera, self.u, self.v, self.seen, columns, self._camera, inverse_distance
         )
@@ -170,7 +170,9 @@ class Window:
 
     def in_view_since_keyframe(self) -> int:
         """How many of the newest keyframe's landmarks project into the current frame."""
-        rows = self.rows[self.seen[-2] & (self.points.state[self.rows] == MAPPED)]
+        newest = len(self.keyframes) - 1
+        columns = seen_in_state(self.rows, self.points.state, MAPPED, self.seen, newest, 1)
+        rows = self.rows.take(columns)
         T_camera_world = inverse(self.T_world_camera[-1])
         camera = self._camera
         return count_in_view(
@@ -215,7 +217,7 @@ class Window:
         fixed[-1] = not self.seen[-1].any()
         return BundleWindow(
             T_world_camera=self.T_world_camera,
-            points_world=self.points.xyz[self.rows[columns]],
+            points_world=self.points.xyz.take(self.rows.take(columns), 0),
             columns=columns,
             u=self.u,
             v=self.v,
@@ -226,7 +228,7 @@ class Window:
         )
 
     def _take(self, columns: I32, result: BundleResult) -> None:
-        self.points.move_to(self.rows[columns], result.points_world)
+        self.points.move_to(self.rows.take(columns), result.points_world)
         self.T_world_camera = result.T_world_camera
         for slot, keyframe in enumerate(self.keyframes):
             keyframe.T_world_camera = self.T_world_camera[slot]
@@ -237,16 +239,17 @@ class Window:
         A landmark at infinity becomes a candidate again, too.
         """
         columns = self.mapped_columns()
-        rows = self.rows[columns]
+        rows = self.rows.take(columns)
+        xyz = self.points.xyz.take(rows, 0)
         forget_outliers(
-            self.T_world_camera[:-1], self.points.xyz[rows], self.u, self.v, self.seen, columns,
+            self.T_world_camera[:-1], xyz, self.u, self.v, self.seen, columns,
             self._camera, outlier_px,
         )  # fmt: skip
         for slot, keyframe in enumerate(self.keyframes):
-            keyframe.keep(self.seen[slot, self.columns[keyframe.rows]])
+            keyframe.keep(self.seen[slot].take(self.columns.take(keyframe.rows)))
         remaining = count_cameras(columns, self.seen, 0, len(self.seen))
         remaining += self.points.base_keyframes[rows]
-        far = at_infinity(self.points.xyz[rows], self.keyframes[-1].T_world_camera[:3, 3])
+        far = at_infinity(xyz, self.keyframes[-1].T_world_camera[:3, 3])
         self.points.remove(rows[(remaining < 2) | far])
 
     def update_statistics(self) -> None:
@@ -257,7 +260,11 @@ class Window:
         moving = count_cameras(mapped, self.seen, self.outside, len(self.keyframes))
         points.keyframes[rows] = points.base_keyframes[rows] + moving
         parallax, sigmas = spread_of_rays(
-            self.T_world_camera, self.seen, columns, points.xyz[rows], focal_px=self._camera.fx
+            self.T_world_camera,
+            self.seen,
+            columns,
+            points.xyz.take(rows, 0),
+            focal_px=self._camera.fx,
         )
         points.parallax_rad[rows] = np.maximum(parallax, points.base_parallax_rad[rows])
         known = np.isfinite(sigmas)

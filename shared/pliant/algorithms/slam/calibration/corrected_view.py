@@ -63,6 +63,8 @@ class CorrectedView:
         return moved.astype(np.float32)
 
     def _magnified(self, points_px: F32, log_factor: float) -> F32:
+        if not log_factor:
+            return points_px
         return self.magnified(points_px, np.full(len(points_px), log_factor))
 
     def image(self, pixels: U8) -> U8:

@@ -29,7 +29,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import inverse
+from pliant.algorithms.geometry import inverse, lengths
 from pliant.algorithms.slam.estimate.pose import (
     Correspondences,
     PoseEstimate,
@@ -63,7 +63,7 @@ _MIN_DEPTH = 1e-6
 
 def spread_of(points: Landmarks, rows: I32, last: Keyframe) -> Spread:
     """How uncertain the rows are, for a camera that may stand where the last keyframe does."""
-    return Spread(vectors=points.spread[rows], standing=last.T_world_camera[:3, 3])
+    return Spread(vectors=points.spread.take(rows, 0), standing=last.T_world_camera[:3, 3])
 
 
 def placed_candidates(points: Landmarks, rows: I32) -> I64:
@@ -101,7 +101,10 @@ def at_infinity(points_world: F64, centre: F64) -> BoolArray:
 
     points_world: (N, 3).   centre: (3,) of a camera that is among them.
     """
-    distances = np.linalg.norm(points_world - centre, axis=1)
+    distances = lengths(points_world - centre)
+    # The median is no less than the minimum: mostly there is no need to know it.
+    if len(distances) and distances.max() <= _ENDLESS * distances.min():
+        return np.zeros(len(distances), np.bool_)
     median = np.median(distances) if len(distances) else 0.0
     return ~(distances <= _ENDLESS * median)
 

@@ -98,7 +98,7 @@ class LandmarkSearch(NamedTuple):
         )  # fmt: skip
         if len(found) < MIN_AGREEING:
             return None
-        seen = Correspondences(self.points.xyz[found], points_px)
+        seen = Correspondences(self.points.xyz.take(found, 0), points_px)
         located = locate(
             [T_world_camera], seen, camera, limits, self.generator, samples=RANSAC_SAMPLES
         )
@@ -120,7 +120,7 @@ class LandmarkSearch(NamedTuple):
         )  # fmt: skip
         if len(found.rows) < limits.min_inliers:
             return None
-        seen = Correspondences(self.points.xyz[found.rows], found.points_px)
+        seen = Correspondences(self.points.xyz.take(found.rows, 0), found.points_px)
         located = refine(T_world_camera, seen, self.camera, limits, near=True)
         enough = max(
             limits.min_inliers,

@@ -157,9 +157,9 @@ def reacquire(
     pixels of grey (H, W), which may be an uncorrected image: the offset of a match from its maximum
     is the same in both.  grey None: only distance and the sign of the curvature decide.
     """
-    projected, visible = _projected(T_world_camera, rows, points, camera)
-    visible_rows = rows[visible]
-    wanted = _Wanted(projected[visible], visible_rows, points.kappas, points.patches)
+    projected, inside = _projected(T_world_camera, rows, points, camera)
+    visible_rows = rows.compress(inside)
+    wanted = _Wanted(projected.compress(inside, 0), visible_rows, points.kappas, points.patches)
     grid = MaximaGrid.build(maxima, camera.width, camera.height, parameters.radius_px)
     choice = np.full(len(visible_rows), -1, np.int32)
     points_px = np.zeros((len(visible_rows), 2), np.float32)
@@ -168,8 +168,8 @@ def reacquire(
     _match(wanted, grid, seen, pixels_of(image), limits, choice, points_px)
     found = choice >= 0
     return Reacquired(
-        rows=visible_rows[found],
-        points_px=points_px[found],
+        rows=visible_rows.compress(found),
+        points_px=points_px.compress(found, 0),
         maxima=choice[found],
         visible=visible_rows,
     )

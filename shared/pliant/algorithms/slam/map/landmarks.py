@@ -8,6 +8,7 @@ from pliant.algorithms.image.patch_alignment import TEMPLATE_MARGIN
 from pliant.algorithms.image.patch_sums import PATCH_SIZE
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
+from pliant.compiler.kernel import kernel
 
 PATCH_SIDE = PATCH_SIZE + 2 * TEMPLATE_MARGIN
 """Side of the stored grey patch, whose samples lie at -4.5, ..., 4.5 px from the landmark."""
@@ -82,7 +83,7 @@ class Landmarks:
         rows = np.concatenate([reused, np.arange(self.count, self.count + fresh, dtype=np.int32)])
         self.count += fresh
         for name in names:
-            getattr(self, name)[rows] = 0
+            getattr(self, name)[reused] = 0
         self.state[rows] = CANDIDATE
         self.ids[rows] = -1
         self.alias[rows] = rows
@@ -103,13 +104,14 @@ class Landmarks:
 
     def place_candidates(self, rows: I32, xyz: F64, spread: F64) -> None:
         """Give candidates provisional positions (n, 3), with their uncertainty (n, 3)."""
-        self.xyz[rows], self.spread[rows] = xyz, spread
+        _set_rows(self.xyz, rows, xyz)
+        _set_rows(self.spread, rows, spread)
 
     def place(
         self, rows: I32, xyz: F64, parallax_rad: F32 | float = 0.0, sigmas: F32 | float = 0.0
     ) -> None:
         """Turn candidates triangulated at (n, 3) into landmarks."""
-        self.xyz[rows] = xyz
+        _set_rows(self.xyz, rows, xyz)
         self.parallax_rad[rows], self.sigmas[rows] = parallax_rad, sigmas
         self.promote(rows)
 
@@ -130,14 +132,14 @@ class Landmarks:
 
     def move_to(self, rows: I32 | I64, xyz: F64) -> None:
         """Set adjusted positions (n, 3) of landmarks or candidates."""
-        self.xyz[rows] = xyz
+        _set_rows(self.xyz, rows, xyz)
 
     def move(self, segment: int, moves: MapMoves) -> None:
         """Move a segment."""
         rows = self.used(segment)
         S = moves.matrices(self.first_keyframe[rows].astype(np.int64))
-        self.xyz[rows] = transform_each(S, self.xyz[rows])
-        self.spread[rows] = (S[:, :3, :3] @ self.spread[rows][:, :, None])[:, :, 0]
+        self.xyz[rows] = transform_each(S, self.xyz.take(rows, 0))
+        self.spread[rows] = (S[:, :3, :3] @ self.spread.take(rows, 0)[:, :, None])[:, :, 0]
 
     def promote(self, rows: I32) -> None:
         """Turn candidates into landmarks, with ids in the given order."""
@@ -148,6 +150,8 @@ class Landmarks:
 
     def merge(self, old: I32, new: I32) -> None:
         """Merge rows into others, none of which is merged; of a row named twice the last counts."""
+        if not len(old):
+            return
         gone = np.unique(old[self.state[old] == MAPPED])
         self._removed.append((gone, self.ids[gone]))
         self.state[old] = MERGED
@@ -182,3 +186,15 @@ class Landmarks:
         used = slice(0, self.count)
         here = (self.state[used] == MAPPED) & (self.segment[used] == segment)
         return np.flatnonzero(here).astype(np.int32)
+
+
+def _set_rows(table: F64, rows: I32 | I64, values: F64) -> None:
+    """Set rows (n,) of a table (N, 3): indexing by an array takes ten times as long."""
+    _write_rows(table, np.ascontiguousarray(rows, np.int32), np.ascontiguousarray(values))
+
+
+@kernel
+def _write_rows(table: F64, rows: I32, values: F64) -> None:
+    for i in range(rows.size):
+        for k in range(3):
+            table[rows[i], k] = values[i, k]

@@ -44,9 +44,9 @@ class TrackLinks:
         before, rows = self.ids, np.full(len(ids), UNLINKED, np.int32)
         gone, back = _carry_over(before, self.rows, ids, rows)
         at_once = len(gone) >= _LOST_AT_ONCE * max(len(before), 1)
-        stay = rows[rows != UNLINKED]
-        mapped = np.count_nonzero(points.state[stay] == MAPPED)
-        if not at_once or self._lost_at_once or mapped >= MAPPED_SHARE * max(len(stay), 1):
+        stay = np.count_nonzero(rows != UNLINKED)
+        mapped = len(_in_state(rows, points.state, MAPPED))
+        if not at_once or self._lost_at_once or mapped >= MAPPED_SHARE * max(stay, 1):
             gone = gone[points.state[self.rows[gone]] == MAPPED]
         self._lost_at_once = at_once
         self._take_back(ids, rows, back, points)

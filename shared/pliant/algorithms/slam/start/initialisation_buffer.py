@@ -83,7 +83,7 @@ class InitialisationBuffer:
             turn = turn_between(self.frames[-1], newest, camera, parameters.localisation)
             turns = [*turns[1 - _KEPT_TURNS :], turn]
         frames = keep_newest(self.frames, newest, parameters.start)
-        return InitialisationBuffer(frames, turns, frame.given)
+        return InitialisationBuffer(frames, turns, frame.given.coloured())
 
     def seen_by(self, before: CorrectedView, after: CorrectedView) -> "InitialisationBuffer":
         """Return the buffer in the pixels of another ideal camera."""

@@ -1,0 +1,167 @@
+"""The map of the last seconds of a scene that deforms, and what surfels take from it."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from breathing_truth import CAMERA, rigid_map, tracks, write_truth
+from surfel_scene import STEP_S, board_renderer
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.deformable.deforming_window import DeformingWindow
+from pliant.algorithms.deformable.moving_landmarks import WindowMap
+from pliant.algorithms.geometry import inverse, pose_to_matrix, so3_exp, transform
+from pliant.algorithms.slam.calibration.corrected_view import corrected_view
+from pliant.algorithms.surfels.parameters import SurfelParameters
+from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
+from pliant.algorithms.surfels.window_follower import WindowFollower
+from pliant.evaluation.surface_truth import SurfaceTruth
+from pliant.messages import codec
+from pliant.messages.types import WORLD_FRAME_ID, DeformingLandmarks, Header
+from pliant.state import load_state, save_state
+
+STEP_NS = 100_000_000
+VIEW = corrected_view(CAMERA, ())
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> SurfaceTruth:
+    return write_truth(tmp_path_factory.mktemp("truth"))
+
+
+def windows(
+    truth: SurfaceTruth, *, rigid: bool = False, still: bool = False, saved: bool = False
+) -> list[WindowMap]:
+    """saved: the state goes through bytes after each frame."""
+    placed = rigid_map(truth).final()
+    poses = {frame: pose_to_matrix(pose[None])[0] for frame, (_, pose) in placed.items()}
+    window, out = DeformingWindow(), list[WindowMap]()
+    for frame, ids, pixels in tracks(truth, rigid=rigid, still=still):
+        if window.take(frame, frame * STEP_NS, ids, pixels.astype(np.float32)):
+            out.append(window.adjust(poses, VIEW))
+        if saved:
+            window = load_state(save_state(window))
+    return out
+
+
+@pytest.fixture(scope="module")
+def found(truth: SurfaceTruth) -> list[WindowMap]:
+    return windows(truth)
+
+
+def ratios(truth: SurfaceTruth, found: WindowMap) -> F64:
+    """Metres by a unit of the window, for each landmark in view."""
+    rows, frame = found.in_view, int(found.frames[-1])
+    points = truth.at_pixels(frame, found.points_px[rows].astype(np.float64))
+    exact = transform(inverse(truth.T_world_camera[frame]), truth.positions(points, frame))
+    there = (found.rest + found.moved()[-1])[rows]
+    depths = transform(inverse(found.T_world_camera[-1]), there)[:, 2]
+    of_each = exact[:, 2] / depths
+    return of_each[np.isfinite(of_each)]
+
+
+def test_each_second_has_a_map_of_the_last_three(
+    truth: SurfaceTruth, found: list[WindowMap]
+) -> None:
+    assert [each.problem for each in found] == [""] * 7
+    assert [int(each.frames[-1]) for each in found] == [18, 28, 38, 48, 58, 68, 78]
+    assert [len(each.frames) for each in found] == [10] + [15] * 6
+    for each in found:
+        of_each = ratios(truth, each)
+        assert len(of_each) > 300
+        assert np.std(of_each / np.median(of_each)) < 0.01
+
+
+def test_windows_continue_each_other(truth: SurfaceTruth, found: list[WindowMap]) -> None:
+    """In one unit, and one world: a camera of both is the same, and moves as it did."""
+    units = [float(np.median(ratios(truth, each))) for each in found]
+    np.testing.assert_allclose(units, np.median(units), rtol=0.01)
+    for before, after in pairwise(found):
+        first = after.frames.tolist().index(int(before.frames[-1]))
+        rotation = after.T_world_camera[first, :3, :3].T @ before.T_world_camera[-1, :3, :3]
+        assert np.trace(rotation) > 3.0 - 0.02**2
+        motion = inverse(after.T_world_camera[first]) @ after.T_world_camera[-1]
+        exact = truth.T_world_camera[after.frames[[first, -1]]]
+        error = units[0] * motion[:3, 3] - (inverse(exact[0]) @ exact[1])[:3, 3]
+        assert np.linalg.norm(error) < 0.01 * units[0] * np.median(np.abs(after.rest[:, 2]))
+
+
+def test_a_scene_that_is_rigid_or_a_camera_that_is_still_has_none(truth: SurfaceTruth) -> None:
+    for each in windows(truth, rigid=True):
+        assert each.problem == "a rigid map predicts its tracks as well, or nearly so"
+        assert not len(each.ids)
+    for each in windows(truth, still=True):
+        assert each.problem
+        assert not len(each.frames)
+
+
+def test_the_same_from_a_saved_state_and_as_a_message(
+    truth: SurfaceTruth, found: list[WindowMap]
+) -> None:
+    header = Header(frame=0, stamp_ns=0, frame_id=WORLD_FRAME_ID)
+
+    def encoded(each: WindowMap) -> bytes:
+        return codec.encode(DeformingLandmarks.of(header, each))
+
+    assert [encoded(e) for e in windows(truth, saved=True)] == [encoded(e) for e in found]
+    again = codec.decode(DeformingLandmarks, encoded(found[0]))
+    np.testing.assert_array_equal(again.moved(), found[0].moved())
+
+
+def test_frames_that_the_rigid_map_lost_are_left_out(truth: SurfaceTruth) -> None:
+    placed = rigid_map(truth).final()
+    poses = {f: pose_to_matrix(p[None])[0] for f, (_, p) in placed.items() if f % 4 == 0}
+    window = DeformingWindow()
+    for frame, ids, pixels in tracks(truth):
+        if window.take(frame, frame * STEP_NS, ids, pixels.astype(np.float32)):
+            each = window.adjust(poses, VIEW)
+            if frame not in poses:
+                assert each.problem == "the rigid map has lost the camera"
+            assert all(f in poses for f in each.frames.tolist())
+
+
+def test_surfels_follow_a_window_in_its_unit() -> None:
+    """A board that is rigid: what a window says of it moves camera and surfels, and no pixel."""
+    motions = [np.eye(4), np.eye(4)]
+    motions[1][0, 3] = 0.02
+    renderer, camera = board_renderer(motions)
+    images = [renderer.frame(n, float(n)).image for n in range(2)]
+    depth = renderer.frame(0, 0.0).depth_m
+    tracker = SurfelTracker(SurfelParameters(camera="moving", max_surfels=60))
+    follower = WindowFollower()
+    first = tracker.start(images[0], depth, camera)
+    follower.note(0, 0, first)
+    second = tracker.track(images[1], STEP_S)
+    # The same scene in units of 2 m; the camera has turned and is elsewhere, some of it has moved.
+    there = transform(inverse(second.T_world_camera), second.positions)
+    T = np.stack([np.eye(4), np.eye(4)])
+    T[1, :3, :3], T[1, :3, 3] = so3_exp(np.array([0.0, 0.01, 0.0])), (0.02, 0.0, 0.0)
+    some = (there[:, 0] > np.quantile(there[:, 0], 0.8)).astype(np.float64)
+    displacements = np.zeros((2, 2, 3))
+    displacements[:, 1, 2] = (-0.01, 0.01)
+    newest = transform(T[1], 0.5 * there)
+    weights = np.stack([1.0 - some, some, 0.0 * some, 0.0 * some], axis=1)
+    window = WindowMap(
+        frames=np.array([0, 1]),
+        T_world_camera=T,
+        ids=np.arange(len(there)),
+        points_px=second.points_px.astype(np.float32),
+        rest=newest - some[:, None] * (0.0, 0.0, 0.01),
+        displacements=displacements,
+        carriers=np.tile(np.arange(4) % 2, (len(there), 1)),
+        weights=weights,
+    )
+    assert follower.take(window) is window
+    ratio = follower.place(tracker, second, 1.0)
+    assert ratio == pytest.approx(2.0, rel=0.01)
+    placed = first.T_world_camera @ T[1]
+    placed[:3, 3] = ratio * T[1, :3, 3]
+    added = tracker.add(images[1], np.zeros_like(depth))
+    np.testing.assert_allclose(added.T_world_camera, placed, atol=1e-9)
+    np.testing.assert_allclose(added.points_px, second.points_px, atol=1e-3)
+    # The same image again: what is stiff keeps the camera where it is.
+    again = tracker.track(images[1], STEP_S)
+    np.testing.assert_array_equal(again.ids, second.ids)
+    np.testing.assert_allclose(again.T_world_camera[:3, 3], placed[:3, 3], atol=3e-3)
+    assert follower.take(WindowMap(problem="it is wrong")) is None
+    assert not follower.deforms
