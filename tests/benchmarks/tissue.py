@@ -22,6 +22,7 @@ from pliant.datasets import open_source
 from pliant.datasets.rectifier import Rectifier
 from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError
+from pliant.evaluation.surfel_truth import roc
 
 _LK: dict[str, Any] = {"winSize": (21, 21), "maxLevel": 4}
 _RETURN_PX = 1.0
@@ -40,6 +41,10 @@ _HEADER = (
     "alive %",
     "right %",
     "wrong %",
+    "confirmed %",
+    "right %",
+    "wrong %",
+    "AUC",
     "LK alive %",
     "right %",
     "wrong %",
@@ -53,7 +58,8 @@ def measure(source: str, frames: str, without: str, overrides: Sequence[str]) ->
     without: polygon "u,v,u,v,..." in the first frame, px: surfels that are born in it do not count,
     such as those on an instrument.  overrides: KEY=VALUE of ``SurfelParameters``.  right: alive and
     within 3 px of the reference, of all surfels that have one.  wrong: farther from it, of the
-    alive ones that have one.  covered: share of the image within 24 px of a tracked surfel.
+    alive ones that have one.  The same of the confirmed ones alone.  AUC: of the confidence, for
+    the alive ones.  covered: share of the image within 24 px of a tracked surfel.
     Raises DatasetError.
     """
     numbers = [int(each) for each in frames.split(",")]
@@ -79,15 +85,20 @@ def _rows(
     for frame in frames:
         truth = reference[frame]
         known = np.isfinite(truth[:, 0])
-        where, alive = rows_of(followed[frame], followed[0].ids[counted])
-        cells = [
-            covered(followed[frame], images[0].shape),
-            *judge(where, alive, truth),
-            *judge(flow[frame], kept[frame], truth),
-        ]
-        rows.append([str(frame), *(f"{100.0 * c:.1f}" for c in cells), f"{known.mean():.0%}"])
+        where, alive, confirmed, confidence = rows_of(followed[frame], followed[0].ids[counted])
+        judged = alive & known
+        area = roc(confidence[judged], _near(where, truth)[judged])[2]
+        seen = covered(followed[frame], images[0].shape)
+        ours = [seen, *judge(where, alive, truth), *judge(where, confirmed, truth)]
+        theirs = judge(flow[frame], kept[frame], truth)
+        cells = [*_shares(ours), f"{area:.2f}", *_shares(theirs), f"{known.mean():.0%}"]
+        rows.append([str(frame), *cells])
     yield f"{source}: {len(points)} surfels, depth flat"
     yield markdown(_HEADER, rows)
+
+
+def _shares(values: Sequence[float]) -> list[str]:
+    return [f"{100.0 * value:.1f}" for value in values]
 
 
 def load(source: str, count: int) -> tuple[list[U8], PinholeCamera]:
@@ -122,19 +133,27 @@ def covered(surfels: SurfelFrame, shape: tuple[int, ...]) -> float:
     return float((gaps <= _COVERED_PX).mean())
 
 
-def rows_of(surfels: SurfelFrame, ids: Any) -> tuple[F64, BoolArray]:
-    """(N, 2) pixels and (N,) whether tracked, of surfels by their ids."""
-    where, alive = np.zeros((len(ids), 2)), np.zeros(len(ids), np.bool_)
+def rows_of(surfels: SurfelFrame, ids: Any) -> tuple[F64, BoolArray, BoolArray, F64]:
+    """(N, 2) pixels, (N,) whether tracked, whether confirmed, and the confidence, by ids."""
+    where, confidence = np.zeros((len(ids), 2)), np.zeros(len(ids))
+    alive, confirmed = np.zeros(len(ids), np.bool_), np.zeros(len(ids), np.bool_)
     _, mine, there = np.intersect1d(ids, surfels.ids, assume_unique=True, return_indices=True)
     where[mine] = surfels.points_px[there]
     alive[mine] = surfels.state[there] == SurfelState.TRACKED
-    return where, alive
+    confirmed[mine], confidence[mine] = surfels.confirmed[there] > 0, surfels.confidence[there]
+    return where, alive, confirmed, confidence
+
+
+def _near(where: F64, truth: F64) -> BoolArray:
+    """(N,) which are within 3 px of the reference, if there is one."""
+    known = np.isfinite(truth[:, :1])
+    off = np.linalg.norm(where - np.where(known, truth, 0.0), axis=1)
+    return known[:, 0] & (off <= _RIGHT_PX)
 
 
 def judge(where: F64, alive: BoolArray, truth: F64) -> tuple[float, float, float]:
     """Shares: alive of all; right of those with a reference; wrong of the alive ones with one."""
-    known = np.isfinite(truth[:, 0])
-    near = np.linalg.norm(where - np.where(known[:, None], truth, 0.0), axis=1) <= _RIGHT_PX
+    known, near = np.isfinite(truth[:, 0]), _near(where, truth)
     right, wrong = alive & known & near, alive & known & ~near
     return (
         float(alive.mean()),

@@ -7,7 +7,9 @@ from flat_texture import CAMERA, DEPTH, texture
 
 from pliant.algorithms.arrays import U8
 from pliant.algorithms.surfels.parameters import SurfelParameters
+from pliant.algorithms.surfels.patch_sampling import X
 from pliant.algorithms.surfels.second_templates import carried_by_neighbours
+from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
 
 STEP_S = 1.0 / 30.0
@@ -80,6 +82,27 @@ def test_a_texture_that_stays_keeps_every_birth_template() -> None:
     np.testing.assert_array_equal(last.birth_zncc, last.zncc)
 
 
+def test_a_search_that_leads_away_from_all_neighbours_is_refused() -> None:
+    """What has grown by 30 % about a surfel looks the same, 23 % nearer."""
+    still = film(0.0, 1)[0]
+    made = SurfelTracker(SurfelParameters(max_surfels=80, levels=2, patch_px=11))
+    first = made.start(still, DEPTH, CAMERA)
+    from_middle = np.linalg.norm(first.points_px - [160.0, 120.0], axis=1)
+    row = int(from_middle.argmin())
+    v, u = np.mgrid[0:240, 0:320].astype(np.float32)
+    du, dv = u - first.points_px[row, 0], v - first.points_px[row, 1]
+    shrunk = np.where(np.maximum(np.abs(du), np.abs(dv)) < 12, 1.0 / 1.3, 1.0).astype(np.float32)
+    grown = cv2.remap(still, u - du + shrunk * du, v - dv + shrunk * dv, cv2.INTER_CUBIC)
+    table = made._table
+    for image, refused in ((still, False), (grown, True)):
+        table.state[row], table.renewed[row] = SurfelState.OUTLIER, True
+        for _ in range(5):  # a fifth of the surfels is searched in each frame
+            made._frame += 1
+            made._update_templates(made._pyramid(image))
+        assert table.renewed[row] == refused
+        np.testing.assert_allclose(table.poses[row, X + 2], 1.0, atol=0.01)
+
+
 def test_neighbours_carry_a_surfel_by_their_affine_motion() -> None:
     generator = np.random.default_rng(0)
     rest = np.column_stack([generator.uniform(-1, 1, (30, 2)), np.full(30, 2.0)])
@@ -90,8 +113,10 @@ def test_neighbours_carry_a_surfel_by_their_affine_motion() -> None:
     confirmed = np.ones(30, np.bool_)
     confirmed[3] = False
     born = np.zeros(30, np.int32)
-    rows, carried = carried_by_neighbours(~confirmed, confirmed, born, rest, points)
+    rows, carried, nearest = carried_by_neighbours(~confirmed, confirmed, born, rest, points)
     assert rows.tolist() == [3]
+    others = np.linalg.norm(rest - rest[3], axis=1)
+    assert nearest.tolist() == [int(np.argsort(others)[1])]
     np.testing.assert_allclose(carried[0], exact, atol=1e-9)
     # Surfels of another batch have another rest, and say nothing.
     born[3] = 5

@@ -73,16 +73,20 @@ def test_every_table_names_sequences_that_there_are(
 def test_the_table_of_maps_names_sequences_that_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
     judged: list[str] = []
 
-    def errors(source: str) -> DeformingMapErrors | str:
+    def errors(source: str) -> tuple[DeformingMapErrors | str, list[str]]:
         parse_builtin(source)
         judged.append(source)
-        return "it is rigid" if "room" in source else DeformingMapErrors(9, 99, *[0.01] * 7)
+        windows = ["8", "7", *["0.25"] * 3, "700"]
+        if "room" in source:
+            return "it is rigid", windows
+        return DeformingMapErrors(9, 99, *[0.01] * 7), windows
 
     monkeypatch.setattr(deforming_maps, "_judged", errors)
     said = list(measure([], tracks=None, tables=[MAPS], frames=9, surfels=20, quick=False))
     assert len(judged) == len(set(judged)) >= 3
     assert sum("1.00" in line for line in said) == len(judged) - 1
     assert sum("| none | it is rigid |" in line for line in said) == 1
+    assert "\n".join(said).count("| 8 | 7 | 0.25 |") == len(judged)
 
 
 def test_mistakes_are_one_line() -> None:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from surfel_scene import STEP_S, board_renderer, film, motion
 
+from pliant.algorithms.surfels.deformation_graph import patch_distortions
 from pliant.algorithms.surfels.parameters import SurfelParameters
-from pliant.algorithms.surfels.patch_sampling import X
+from pliant.algorithms.surfels.patch_sampling import A, X
 from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.algorithms.surfels.surfel_table import SurfelTable, frame_of
 from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
@@ -23,11 +24,10 @@ def tracked_table(neighbours: int) -> SurfelTable:
     return tracker._table
 
 
-def confidence(table: SurfelTable, number: int = 1, *, depth_is_known: bool = True) -> np.ndarray:
+def confidence(table: SurfelTable) -> np.ndarray:
     frame = frame_of(
-        table, frame=number, segment=0, lost=False, T_world_camera=np.eye(4),
-        depth_is_known=depth_is_known,
-    )  # fmt: skip
+        table, frame=1, segment=0, lost=False, T_world_camera=np.eye(4), depth_is_known=True
+    )
     assert frame.confidence.shape == frame.ids.shape
     return frame.confidence
 
@@ -65,9 +65,27 @@ def test_old_positions_of_lost_surfels_do_not_count() -> None:
     np.testing.assert_allclose(after[lost], 0.3)
 
 
-def test_made_up_depth_must_be_tried() -> None:
-    table = tracked_table(8)
-    known = confidence(table)
-    for age, share in ((0, 1 / 2), (1, 2 / 3), (98, 99 / 100)):
-        tried = confidence(table, age, depth_is_known=False)
-        np.testing.assert_allclose(tried, share * known, rtol=1e-5)
+def test_on_made_up_depth_a_patch_that_is_distorted_otherwise_is_doubtful() -> None:
+    motions = [motion((0.0, 0.0, 0.0), (0.001 * k, 0.0, 0.0)) for k in range(2)]
+    renderer, camera = board_renderer(motions)
+    first, second = film(renderer, 2)
+    tracker = SurfelTracker(SurfelParameters(max_surfels=60, levels=2, depth_from="flat"))
+    tracker.start(first.image, np.ones_like(first.depth_m), camera)
+    before = tracker.track(second.image, STEP_S)
+    tracked = before.state == SurfelState.TRACKED
+    assert before.confidence[tracked].min() > 0.9
+    assert before.confirmed[tracked].all()
+    table = tracker._table
+    row = int(np.argmin(np.linalg.norm(table.poses[:, X : X + 2], axis=1)))
+    poses = table.poses.copy()
+    poses[row, A : A + 3] *= 1.8
+    known = np.ones(len(table), np.bool_)
+    table.distortions = patch_distortions(poses, table.edges, known)
+    assert table.distortions[row] == pytest.approx(0.8, abs=0.1)
+    assert np.median(table.distortions) < 0.1
+    after = frame_of(
+        table, frame=1, segment=0, lost=False, T_world_camera=np.eye(4), depth_is_known=False
+    )
+    assert after.confidence.argmin() == row
+    assert after.confirmed.argmin() == row
+    assert after.confirmed.sum() == len(table) - 1

@@ -170,22 +170,31 @@ def _edge_rows(
 
 
 @fast_kernel
-def _median_strains(edges: Edges, residuals: F64, out: F64) -> None:
-    ends = edges.ends
-    starts = np.zeros(len(out) + 1, np.int64)
+def _by_surfel(ends: I64, count: int) -> tuple[I64, I64]:
+    """Starts (count + 1,) and pairs (2 E,): those of each surfel one after another."""
+    starts = np.zeros(count + 1, np.int64)
     for e in range(len(ends)):
         starts[ends[e, 0] + 1] += 1
         starts[ends[e, 1] + 1] += 1
-    for s in range(len(out)):
+    for s in range(count):
         starts[s + 1] += starts[s]
-    filled, values = starts[:-1].copy(), np.empty(2 * len(ends))
+    filled, pairs = starts[:-1].copy(), np.empty(2 * len(ends), np.int64)
     for e in range(len(ends)):
-        r = residuals[e, 0]
-        length = math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
         for side in range(2):
             s = ends[e, side]
-            values[filled[s]] = length / edges.lengths[e]
+            pairs[filled[s]] = e
             filled[s] += 1
+    return starts, pairs
+
+
+@fast_kernel
+def _median_strains(edges: Edges, residuals: F64, out: F64) -> None:
+    starts, pairs = _by_surfel(edges.ends, len(out))
+    values = np.empty(len(pairs))
+    for k in range(len(pairs)):
+        e = pairs[k]
+        r = residuals[e, 0]
+        values[k] = math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2]) / edges.lengths[e]
     for s in range(len(out)):
         if starts[s + 1] > starts[s]:
             out[s] = np.median(values[starts[s] : starts[s + 1]])
@@ -198,10 +207,59 @@ def median_strains(poses: F64, edges: Edges, known: BoolArray) -> F64:
     this share of their distance.  NaN without edges between known ones.
     """
     out = np.full(len(poses), np.nan)
-    rows = known[edges.ends].all(axis=1)
-    used = Edges(edges.ends[rows], edges.first[rows], edges.second[rows], edges.lengths[rows])
+    used = _between(edges, known)
     if len(used.ends):
         _median_strains(used, edge_rows(poses, used)[1], out)
+    return out
+
+
+def _between(edges: Edges, known: BoolArray) -> Edges:
+    """The pairs of known surfels."""
+    rows = known[edges.ends].all(axis=1)
+    return Edges(edges.ends[rows], edges.first[rows], edges.second[rows], edges.lengths[rows])
+
+
+@fast_kernel
+def _image_matrix(pose: F64, out: F64) -> None:
+    """The four entries of a patch's distortion in the image since its birth, row by row."""
+    f11, f12, f22, z = pose[F], pose[F + 1], pose[F + 2], pose[X + 2]
+    c = f11 * pose[A + 2] + f12 * pose[B + 2], f12 * pose[A + 2] + f22 * pose[B + 2]
+    for k in range(2):
+        a, b, share = pose[A + k], pose[B + k], pose[X + k] / z
+        out[2 * k] = (f11 * a + f12 * b - share * c[0]) / z
+        out[2 * k + 1] = (f12 * a + f22 * b - share * c[1]) / z
+
+
+@fast_kernel
+def _patch_distortions(poses: F64, ends: I64, out: F64) -> None:
+    starts, pairs = _by_surfel(ends, len(out))
+    matrices, others = np.empty((len(poses), 4)), np.empty(len(pairs))
+    for s in range(len(poses)):
+        _image_matrix(poses[s], matrices[s])
+    for s in range(len(out)):
+        count, squares = starts[s + 1] - starts[s], 0.0
+        if count == 0:
+            continue
+        for entry in range(4):
+            for k in range(count):
+                e = pairs[starts[s] + k]
+                other = ends[e, 1] if ends[e, 0] == s else ends[e, 0]
+                others[k] = matrices[other, entry]
+            difference = matrices[s, entry] - np.median(others[:count])
+            squares += difference * difference
+        out[s] = math.sqrt(squares)
+
+
+def patch_distortions(poses: F64, edges: Edges, known: BoolArray) -> F64:
+    """(N,) how differently from its neighbours' a surfel's patch is distorted in the image.
+
+    The Frobenius norm of the difference of its 2 x 2 matrix since birth, which is then the
+    identity, from the median of its neighbours', entry by entry.  poses: (N, POSE_FLOATS) in the
+    camera's frame, of surfels that were born in one frame.  known: (N,) surfels that are compared.
+    NaN without edges between known ones.
+    """
+    out = np.full(len(poses), np.nan)
+    _patch_distortions(poses, _between(edges, known).ends, out)
     return out
 
 

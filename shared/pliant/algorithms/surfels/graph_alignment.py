@@ -51,6 +51,9 @@ _CG_TOLERANCE = 1e-4
 _BRIGHTNESS_SIGMA = 0.01
 """Relative standard deviation of what brightness tells: 5 and 95 % of the surfels of a rendered
 scene with tilting sheets are off by 0.02."""
+_MADE_UP_BEND = 1.0 / 3.0
+"""Share of ``bend`` on made-up depth: there a turn is a distortion in the image, which neighbours
+share."""
 _DIAGONAL = np.arange(RIGID)
 _OTHERS = models.MOST_PARAMETERS - RIGID
 
@@ -313,6 +316,7 @@ def align_graph(
     poses[~found] = start[~found]
     seen, x = found.astype(np.uint8), np.zeros((n, RIGID))
     damping, travelled = np.full(n, limits.start_lambda), np.zeros(n)
+    bend = p.bend * (_MADE_UP_BEND if p.depth_from == "flat" else 1.0)
     # What is not seen goes where its neighbours do.
     weights = equilibrium.weights * found
     for _ in range(steps):
@@ -330,7 +334,7 @@ def align_graph(
             weight = OMEGA_E / _BRIGHTNESS_SIGMA**2
             add_light(poses, measured, weight, seen, damped, descent)
         pull = OMEGA_E * w / edges.lengths**2
-        springs = Springs(edges.ends, arms, pull / p.strain**2, pull / p.bend**2, residuals)
+        springs = Springs(edges.ends, arms, pull / p.strain**2, pull / bend**2, residuals)
         solve_graph(damped, descent, springs, _CG_ITERATIONS, _CG_TOLERANCE, x)
         if not np.isfinite(x).all():
             break

@@ -52,7 +52,10 @@ class SurfelParameters(Parameters):
         ),
     )
     bend: float = Field(
-        default=0.3, gt=0.0, description="The same for the angle between neighbours, rad."
+        default=0.3,
+        gt=0.0,
+        description="The same for the angle between neighbours, rad; a third of it on made-up "
+        "depth (flat).",
     )
 
     depth_from: Literal["sensor", "map", "flat"] = Field(

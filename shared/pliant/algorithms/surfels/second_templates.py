@@ -101,14 +101,16 @@ def restore(rows: I64, birth: list[Templates], used: list[Templates]) -> None:
 
 def carried_by_neighbours(
     wanted: BoolArray, confirmed: BoolArray, born: I32, rest: F64, points: F64
-) -> tuple[I64, F64]:
-    """Return the wanted rows with confirmed neighbours, and the positions that these predict.
+) -> tuple[I64, F64, I64]:
+    """Return the wanted rows with confirmed neighbours, the positions that these predict, and the
+    nearest of them.
 
     born: (N,) frame of birth: only surfels of one batch have been at ``rest`` together.  rest,
     points: (N, 3) positions at birth and now, world.  The displacements of the nearest are fitted
     by an affine one, with minimum norm if they lie in a plane.
     """
     found: list[int] = []
+    nearest: list[int] = []
     moves: list[F64] = []
     for row in np.flatnonzero(wanted):
         others = np.flatnonzero(confirmed & (born == born[row]) & (np.arange(len(born)) != row))
@@ -121,5 +123,7 @@ def carried_by_neighbours(
         design = np.column_stack([np.ones(len(near)), offsets[near] / max(scale, 1e-12)])
         weights = np.linalg.pinv(design, rcond=_FLAT)[0]
         found.append(int(row))
+        nearest.append(int(others[near[0]]))
         moves.append(rest[row] + weights @ (points[others[near]] - rest[others[near]]))
-    return np.array(found, np.int64), np.array(moves).reshape(-1, 3)
+    places = np.array(moves).reshape(-1, 3)
+    return np.array(found, np.int64), places, np.array(nearest, np.int64)

@@ -33,6 +33,11 @@ from pliant.algorithms.surfels.validation import (
 _EVEN_STRAIN, _STEEPNESS = 0.15, 1.2
 """Half of the surfels with this median strain are within 1 % of their depth; fitted on the rendered
 scenes of ``scripts/bench surfels``."""
+_EVEN_DISTORTION, _DISTORTION_STEEPNESS = 0.7, 2.0
+"""The same for the distortion, within 3 px in the image; fitted on half of eight videos of tissue,
+tested on the others."""
+_DISTORTED = 0.5
+"""Distortion beyond which no surfel is confirmed: of those at it, half are wrong."""
 
 
 def _none() -> list[Templates]:
@@ -47,6 +52,8 @@ class SurfelTable:
     birth: list[Templates] = field(default_factory=_none)  # the same at birth
     renewed: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))  # not that of birth
     birth_zncc: F64 = field(default_factory=lambda: np.zeros(0))  # with the birth template
+    # ``patch_distortions`` on made-up depth, else 0.
+    distortions: F64 = field(default_factory=lambda: np.zeros(0))
     poses: F64 = field(default_factory=lambda: np.zeros((0, POSE_FLOATS)))  # last good ones
     rest: F64 = field(default_factory=lambda: np.zeros((0, 3)))  # X^0 of Eq. 20, world
     sigmas: F64 = field(default_factory=lambda: np.zeros(0))  # root of its Sigma, metres
@@ -83,6 +90,7 @@ class SurfelTable:
             setattr(self, name, [join(a, b) for a, b in pairs])
         self.renewed = np.concatenate([self.renewed, np.zeros(n, np.bool_)])
         self.birth_zncc = np.concatenate([self.birth_zncc, np.ones(n)])
+        self.distortions = np.concatenate([self.distortions, np.zeros(n)])
         self.poses = np.concatenate([self.poses, poses])
         self.guesses = np.concatenate([self.guesses, poses])
         self.tried = np.concatenate([self.tried, poses[:, X : X + 3]])
@@ -107,6 +115,7 @@ class SurfelTable:
         for name in (
             "renewed",
             "birth_zncc",
+            "distortions",
             "poses",
             "rest",
             "sigmas",
@@ -136,8 +145,8 @@ class SurfelTable:
 
     @property
     def confirmed(self) -> BoolArray:
-        """(N,) whether a surfel is tracked and its birth template is in use."""
-        return self.tracked & ~self.renewed
+        """(N,) tracked by the birth template, its patch distorted as its neighbours' are."""
+        return self.tracked & ~self.renewed & ~(self.distortions > _DISTORTED)
 
 
 def frame_of(
@@ -176,26 +185,28 @@ def frame_of(
         tried=table.tried.copy(),
         birth_zncc=_f32(table.birth_zncc),
         confirmed=table.confirmed.astype(np.uint8),
-        confidence=_f32(_confidence(table, ages, depth_is_known=depth_is_known)),
+        confidence=_f32(_confidence(table, depth_is_known=depth_is_known)),
     )
 
 
-def _confidence(table: SurfelTable, ages: I32, *, depth_is_known: bool) -> F64:
-    """(N,) probability that a position is within 1 % of its depth.
+def _confidence(table: SurfelTable, *, depth_is_known: bool) -> F64:
+    """(N,) probability that a position is right: within 1 % of its depth, or on made-up depth in
+    its place in the image.
 
-    The neighbours decide: an error of depth changes hardly any pixel, but strains the edges.  An
-    error that all of them share strains nothing.  Only surfels that are both tracked are compared:
-    the others have old positions.  Without such edges the ZNCC with the birth template remains, and
+    The neighbours decide.  An error of depth changes hardly any pixel, but strains the edges.  On
+    made-up depth a surfel that slides in the image is distorted otherwise than they are.  An error
+    that all of them share shows in neither.  Only surfels that are both tracked are compared: the
+    others have old positions.  Without such edges the ZNCC with the birth template remains, and
     half of it where a surfel is not tracked.
-
-    A new surfel agrees with its neighbours by its birth.  On made-up depth that tells nothing, so
-    there each frame counts as one trial (rule of succession).
     """
-    strains = median_strains(table.poses, table.edges, table.tracked)
-    agreement = 1.0 / (1.0 + (strains / _EVEN_STRAIN) ** _STEEPNESS)
+    if depth_is_known:
+        off = median_strains(table.poses, table.edges, table.tracked) / _EVEN_STRAIN
+        agreement = 1.0 / (1.0 + off**_STEEPNESS)
+    else:
+        off = np.where(table.tracked, table.distortions, np.nan) / _EVEN_DISTORTION
+        agreement = 1.0 / (1.0 + off**_DISTORTION_STEEPNESS)
     likeness = np.clip(table.birth_zncc, 0.0, 1.0) * np.where(table.tracked, 1.0, 0.5)
-    confidence = np.where(np.isnan(strains), likeness, agreement)
-    return confidence if depth_is_known else confidence * (ages + 1.0) / (ages + 2.0)
+    return np.where(np.isnan(agreement), likeness, agreement)
 
 
 def _f32(values: F64) -> F32:

@@ -38,9 +38,10 @@ from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 from pliant.algorithms.surfels.surfel_table import SurfelTable, frame_of
 from pliant.algorithms.surfels.template_update import RELOCATED_ZNCC, TemplateUpdate
 
-_TOGETHER_LEVELS = {False: 2, True: 1}
-"""Levels, the finest, at which surfels with neighbours move as one: before a static camera, and
-before a moving one, where more takes twice as long and the camera is hardly better."""
+_TOGETHER_LEVELS, _FEWER_TOGETHER = 2, 1
+"""Levels, the finest, at which surfels with neighbours move as one.  Fewer before a moving camera,
+where more take twice as long and the camera is hardly better, and on made-up depth, whose shape is
+wrong: at half the size it would lead to where the image does not fit."""
 _KEPT = 0.7
 """Minimum share of the previous frame's tracked surfels; below it, views are searched."""
 _FOUND_BACK = 0.5
@@ -300,8 +301,9 @@ class SurfelTracker:
             guides = everyone
         T_camera_world, equilibrium = inverse(self._T_world_camera), no_equilibrium(n)
         start, weights = poses, OMEGA_E / table.sigmas**2
-        together = _TOGETHER_LEVELS[moving] if len(table.edges.ends) else 0
         made_up = self._parameters.depth_from == "flat"
+        together = _FEWER_TOGETHER if moving or made_up else _TOGETHER_LEVELS
+        together = together if len(table.edges.ends) else 0
         for number in range(coarsest, -1, -1):
             level = pyramid[number]
             if number == coarsest:

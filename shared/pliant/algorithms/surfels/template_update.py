@@ -7,10 +7,11 @@ import numpy as np
 from pliant.algorithms.arrays import F64, BoolArray
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.surfels import validation
+from pliant.algorithms.surfels.deformation_graph import edge_rows, patch_distortions, torn_off
 from pliant.algorithms.surfels.deformation_models import move_poses
 from pliant.algorithms.surfels.graph_alignment import relocate
 from pliant.algorithms.surfels.parameters import SurfelParameters
-from pliant.algorithms.surfels.patch_sampling import BIAS, GAIN, Level, X
+from pliant.algorithms.surfels.patch_sampling import BIAS, GAIN, A, Level, X
 from pliant.algorithms.surfels.second_templates import (
     birth_bias,
     carried_by_neighbours,
@@ -59,8 +60,10 @@ class TemplateUpdate:
         poses[:, BIAS] = birth_bias(poses, table.templates[0].means)
         poses[:, BIAS] -= table.birth[0].means * (1.0 - poses[:, GAIN])
         self._align_birth_templates(poses)
+        self._compare_distortions(T_camera_world)
         self._search(frame, poses, T_camera_world)
         self._renew(T_camera_world)
+        self._compare_distortions(T_camera_world)
 
     def _align_birth_templates(self, poses: F64) -> None:
         """Measure the birth templates at the tracked positions, and align them from there."""
@@ -79,25 +82,41 @@ class TemplateUpdate:
         guarded = table.tracked & table.renewed & (table.birth_zncc < _GUARD_ZNCC)
         table.state[guarded] = SurfelState.OUTLIER
 
+    def _compare_distortions(self, T_camera_world: F64) -> None:
+        """On made-up depth, which strains of edges do not judge."""
+        table = self.table
+        if self.parameters.depth_from == "flat":
+            poses = move_poses(table.poses, T_camera_world)
+            table.distortions = patch_distortions(poses, table.edges, table.tracked)
+
     def _search(self, frame: int, poses: F64, T_camera_world: F64) -> None:
-        """Search a share of the unconfirmed surfels, so that every frame costs the same."""
+        """Search a share of the unconfirmed surfels, so that every frame costs the same.
+
+        Alone a surfel finds its pixel, but may drift along its ray.  So one that has torn itself
+        off its neighbours is refused, as in tracking.
+        """
         table, p = self.table, self.parameters
         due = ~table.confirmed & (table.ids % _SEARCH_PERIOD == frame % _SEARCH_PERIOD)
-        rows, points = carried_by_neighbours(
+        rows, points, nearest = carried_by_neighbours(
             due, table.confirmed, table.born, table.rest, table.poses[:, X : X + 3]
         )
         if not len(rows):
             return
         found, searched = new_validations(len(table)), np.zeros(len(table), np.uint8)
         poses[rows, X : X + 3] = transform(T_camera_world, points)
+        if p.depth_from == "flat":  # all began alike, and its own may be that of a wrong place
+            poses[rows, A:GAIN] = move_poses(table.poses[nearest], T_camera_world)[:, A:GAIN]
         searched[rows] = 1
         validation.validate_all(poses, searched, self.matchers[0], found)
         before = found[:, [validation.U, validation.V]]
         for matcher in reversed(self.matchers[:_SEARCH_LEVELS]):
             align_all(poses, searched, no_equilibrium(len(table)), matcher)
         validation.validate_all(poses, searched, self.matchers[0], found)
-        least = max(p.min_zncc, RELOCATED_ZNCC)
-        self._confirm(searched > 0, poses, found, before, least, _SEARCH_PATCH * p.patch_px)
+        moved = move_poses(table.poses, T_camera_world)
+        moved[rows] = poses[rows]
+        torn = torn_off(table.edges, edge_rows(moved, table.edges)[0], len(table))
+        least, most_px = max(p.min_zncc, RELOCATED_ZNCC), _SEARCH_PATCH * p.patch_px
+        self._confirm((searched > 0) & ~torn, poses, found, before, least, most_px)
 
     def _confirm(
         self, wanted: BoolArray, poses: F64, found: F64, before: F64, least: float, most_px: float
