@@ -250,7 +250,11 @@ def _budget(output: Path, looks: Sequence[_Look], began_ns: int) -> Budget:
     spent = max(1, frames - 1)
     for name in dict.fromkeys(name for look in looks for name in look.cpu_s):
         cpu = [look.cpu_s[name] for look in looks if name in look.cpu_s]
-        at_first, at_last = first.cpu_s.get(name, 0.0), last.cpu_s.get(name, cpu[-1])
+        before = [
+            each.cpu_s[name] for each in looks if each.at_ns <= first.at_ns and name in each.cpu_s
+        ]
+        at_first = before[-1] if before else 0.0  # the fork server has left by then
+        at_last = last.cpu_s.get(name, cpu[-1])
         budget.processes[name] = Cost(
             start_s=at_first,
             frame_ms=1e3 * (at_last - at_first) / spent,
