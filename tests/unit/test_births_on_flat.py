@@ -42,8 +42,7 @@ def test_surface_that_comes_into_view_gets_surfels() -> None:
     assert np.count_nonzero(new) > 10
     assert len(last.ids) <= 300
     assert last.points_px[new, 0].max() > 280
-    # The depth of those around, which images hardly determine here.
-    np.testing.assert_allclose(last.positions[new, 2], 1.0, atol=0.03)
+    np.testing.assert_allclose(last.positions[new, 2], 1.0, atol=0.01)
     # They come at once, not on what is tracked, and do not hold it.
     assert len({int(born) for born in last.born[new]}) == 1
     old = last.points_px[~new & (last.state == SurfelState.TRACKED)]

@@ -222,7 +222,8 @@ class SurfelTracker:
             self._lost_for_s, self._followed = 0.0, followed
 
     def _made_up_depth(self) -> F64 | None:
-        """Depth for births on ``flat``, as often as places become free.
+        """Depth for births on ``flat``, as often as places become free: that of confirmed surfels,
+        as others may have drifted along their rays.
 
         A scene that is missing for a single frame, covered or blurred, is no other scene.
         """
@@ -234,8 +235,8 @@ class SurfelTracker:
         if gone:
             self._lost = True
             return np.ones((camera.height, camera.width))
-        points = table.validations[table.tracked, validation.U : validation.V + 1]
-        there = transform(inverse(self._T_world_camera), table.poses[table.tracked, X : X + 3])
+        points = table.validations[table.confirmed, validation.U : validation.V + 1]
+        there = transform(inverse(self._T_world_camera), table.poses[table.confirmed, X : X + 3])
         return depth_between(points, there[:, 2], camera)
 
     def _remember(self, image: U8, seen: Features | None = None) -> None:
