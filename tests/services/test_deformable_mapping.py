@@ -94,7 +94,3 @@ def test_a_service_that_is_started_again_continues(inputs: Messages, mapped: lis
     deformable_mapping.run(again, config, SilentMonitor())
     made = again.outputs[topics.MAP_DEFORMING]
     assert [codec.encode(m) for m in made] == [codec.encode(m) for m in mapped[before + 1 :]]
-
-
-def test_the_first_call_compiles_everything() -> None:
-    deformable_mapping.warm_up()

@@ -151,8 +151,8 @@ def test_surfels_follow_a_window_in_its_unit() -> None:
         carriers=np.tile(np.arange(4) % 2, (len(there), 1)),
         weights=weights,
     )
-    assert follower.take(window) is window
-    ratio = follower.place(tracker, second, 1.0)
+    assert follower.judge(window)
+    ratio = follower.place(tracker, second, window)
     assert ratio == pytest.approx(2.0, rel=0.01)
     placed = first.T_world_camera @ T[1]
     placed[:3, 3] = ratio * T[1, :3, 3]
@@ -163,5 +163,5 @@ def test_surfels_follow_a_window_in_its_unit() -> None:
     again = tracker.track(images[1], STEP_S)
     np.testing.assert_array_equal(again.ids, second.ids)
     np.testing.assert_allclose(again.T_world_camera[:3, 3], placed[:3, 3], atol=3e-3)
-    assert follower.take(WindowMap(problem="it is wrong")) is None
+    assert not follower.judge(WindowMap(problem="it is wrong"))
     assert not follower.deforms

@@ -115,7 +115,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
                 frame = state.tracker.track(image.grey, interval_s, prediction, metres)
             if view is not None:
                 with monitor.stage("births"):
-                    frame, note = _add(state, image, frame, view, config)
+                    frame, note = _add(state, heard, frame, view, config)
             state.follower.note(image.frame, image.stamp_ns, frame)
         elif not missing:
             with monitor.stage("start"):
@@ -184,9 +184,8 @@ def _look_at_map(state: _State, heard: _Heard, config: Config) -> MapView | None
     view = state.map_depth.take(heard.update, heard.keyframe, heard.frame, max_sigma=max_sigma)
     if heard.deforming is None:
         return view
-    found = state.follower.take(heard.deforming)
-    if found is not None:
-        return view_of_window(found, state.stream.camera, heard.update.segment)
+    if state.follower.judge(heard.deforming):
+        return view_of_window(heard.deforming, state.stream.camera, heard.update.segment)
     return None if state.follower.deforms else view
 
 
@@ -212,25 +211,26 @@ def _start(
 
 
 def _add(
-    state: _State, image: Image, frame: SurfelFrame, view: MapView, config: Config
+    state: _State, heard: _Heard, frame: SurfelFrame, view: MapView, config: Config
 ) -> tuple[SurfelFrame, str]:
     """Create surfels on a later keyframe of our own map; otherwise return the reason why not."""
+    image = heard.image.grey
     if frame.lost:
         # No surfels are left to compare with.  For the same map the last ratio holds.
         if view.segment != state.segment:
             state.ratio, state.segment = 1.0, view.segment
         T_world_camera = view.T_world_camera.copy()
         T_world_camera[:3, 3] *= state.ratio
-        return state.tracker.add(image.grey, state.ratio * view.depth, T_world_camera), ""
+        return state.tracker.add(image, state.ratio * view.depth, T_world_camera), ""
     state.segment = view.segment
-    if state.follower.deforms:
-        state.ratio = state.follower.place(state.tracker, frame, state.ratio)
-        return state.tracker.add(image.grey, state.ratio * view.depth), ""
+    if state.follower.deforms and heard.deforming is not None:
+        state.ratio = state.follower.place(state.tracker, frame, heard.deforming)
+        return state.tracker.add(image, state.ratio * view.depth), ""
     found = agree(view.depth, frame, config.surfels.patch_px)
     if found.depth is None:
         return frame, f"no surfels are created on the map: {found.problem}"
     state.ratio = found.ratio
-    return state.tracker.add(image.grey, found.depth), ""
+    return state.tracker.add(image, found.depth), ""
 
 
 def warm_up() -> None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
+from pliant.algorithms.geometry import transform
 from pliant.algorithms.surfels.births import Births, join, select
 from pliant.algorithms.surfels.brightness import brightness
 from pliant.algorithms.surfels.deformation_graph import (
@@ -102,6 +103,16 @@ class SurfelTable:
         self.born = np.concatenate([self.born, np.full(n, frame, np.int32)])
         self.missing = np.concatenate([self.missing, np.zeros(n)])
         self.validations = np.concatenate([self.validations, validations])
+
+    def move(self, T: F64) -> None:
+        """Move all surfels by T (4, 4), world."""
+        self.poses, self.guesses = move_poses(self.poses, T), move_poses(self.guesses, T)
+        self.tried, self.rest = transform(T, self.tried), transform(T, self.rest)
+
+    def settle(self, rows: I64, rest: F64, sigmas: F64) -> None:
+        """Change rest (R, 3) and sigmas (R,) of some rows."""
+        self.rest, self.sigmas = self.rest.copy(), self.sigmas.copy()
+        self.rest[rows], self.sigmas[rows] = rest, sigmas
 
     def copy(self) -> "SurfelTable":
         """Return a copy that can be tracked into another frame."""

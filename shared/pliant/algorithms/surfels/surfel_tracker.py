@@ -151,20 +151,15 @@ class SurfelTracker:
 
     def place(self, T_world_camera: F64) -> SurfelFrame:
         """Correct the camera's pose (4, 4): the world moves with it, and no pixel changes."""
-        table, T = self._table, T_world_camera @ inverse(self._T_world_camera)
-        table.poses, table.guesses = move_poses(table.poses, T), move_poses(table.guesses, T)
-        table.tried, table.rest = transform(T, table.tried), transform(T, table.rest)
+        self._table.move(T_world_camera @ inverse(self._T_world_camera))
         self._T_world_camera = T_world_camera.copy()
         return self._result()
 
     def settle(self, rows: I64, rest: F64, sigmas: F64) -> None:
-        """Change where surfels rest (R, 3), world, and how far they move from there (R,): Eq. 20.
-
-        rows: of the last result.
+        """Change where rows of the last result rest (R, 3), world, and by how much they move from
+        there (R,): Eq. 20.
         """
-        table = self._table
-        table.rest, table.sigmas = table.rest.copy(), table.sigmas.copy()
-        table.rest[rows], table.sigmas[rows] = rest, sigmas
+        self._table.settle(rows, rest, sigmas)
 
     def _pyramid(self, image: U8) -> list[Level]:
         camera, p = self._camera, self._parameters

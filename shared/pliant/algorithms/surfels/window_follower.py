@@ -19,62 +19,57 @@ from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
 
 _AROUND = 4
 """Landmarks around a surfel."""
-_FEWEST = 8
-"""Surfels that determine a unit."""
 
 
 @dataclass
 class WindowFollower:
-    """deforms: whether the last window is trusted.    cameras: stamp, and T_world_camera (4, 4), of
-    frames that a window may have, since the last one that placed the camera.
-    newest: the last window with landmarks."""
+    """deforms: whether the last window is trusted.    segment: of the surfels.
+    cameras: stamp, and T_world_camera (4, 4), of frames of that segment which a window may have,
+    since the last one that placed the camera."""
 
     deforms: bool = False
+    segment: int = 0
     cameras: dict[int, tuple[int, F64]] = field(default_factory=dict[int, tuple[int, F64]])
-    newest: WindowMap | None = None
 
     def note(self, frame: int, stamp_ns: int, surfels: SurfelFrame) -> None:
         """Remember a frame, which must have pixels."""
+        if surfels.lost or surfels.segment != self.segment:  # another segment is another world
+            self.cameras, self.segment = {}, surfels.segment
         if surfels.lost:
-            self.cameras = {}
             return
         self.cameras[frame] = stamp_ns, surfels.T_world_camera.copy()
         for old in [n for n, (at, _) in self.cameras.items() if stamp_ns - at > SPAN_NS]:
             del self.cameras[old]
 
-    def take(self, found: WindowMap) -> WindowMap | None:
-        """The window of a frame, if it has one that is trusted."""
+    def judge(self, found: WindowMap) -> bool:
+        """Whether a frame has a window that is trusted."""
         if found.problem:
             self.deforms = False
-        if not len(found.frames):
-            return None
-        self.deforms, self.newest = True, found
-        return found
+        is_trusted = len(found.frames) > 0
+        self.deforms = self.deforms or is_trusted
+        return is_trusted
 
-    def place(self, tracker: SurfelTracker, surfels: SurfelFrame, ratio: float) -> float:
-        """Place the camera by the newest window; returns units of the surfels by one of the window.
+    def place(self, tracker: SurfelTracker, surfels: SurfelFrame, found: WindowMap) -> float:
+        """Place the camera by a window; returns units of the surfels by one of the window.
 
-        surfels: in the newest keyframe.    ratio: before.    The camera moves as in the window,
-        since the first of its keyframes that is known: if possible the last one that was placed so.
+        surfels: in the newest keyframe, not lost.    The camera moves as in the window, since the
+        first of its keyframes that is known: if possible the last one that was placed so.
         """
-        found = self.newest
-        assert found is not None
-        ratio = _ratio(found, surfels) or ratio
-        rows = [row for row, frame in enumerate(found.frames.tolist()) if frame in self.cameras]
+        ratio = _ratio(found, surfels)
+        known = self.cameras if surfels.segment == self.segment else {}
+        rows = [row for row, frame in enumerate(found.frames.tolist()) if frame in known]
         if rows:
             motion = inverse(found.T_world_camera[rows[0]]) @ found.T_world_camera[-1]
             motion[:3, 3] *= ratio
-            surfels = tracker.place(self.cameras[int(found.frames[rows[0]])][1] @ motion)
+            surfels = tracker.place(known[int(found.frames[rows[0]])][1] @ motion)
         self.cameras = {}
         _settle(tracker, surfels, found, ratio)
         return ratio
 
 
 def _ratio(found: WindowMap, surfels: SurfelFrame) -> float:
-    """Units of the surfels by one of the window, 0 if too few surfels are tracked."""
+    """Units of the surfels by one of the window: the median of their depths by the landmarks'."""
     tracked = np.flatnonzero(surfels.state == SurfelState.TRACKED)
-    if len(tracked) < _FEWEST:
-        return 0.0
     near = _landmarks_around(found, surfels, tracked)
     landmarks = transform(inverse(found.T_world_camera[-1]), found.rest + found.moved()[-1])
     depths = transform(inverse(surfels.T_world_camera), surfels.positions[tracked])[:, 2]
