@@ -130,9 +130,11 @@ def table_of(file: Path) -> tuple[list[str], list[list[str]]]:
     lines = [line.replace('"', "") for line in text_lines(file)]
     first = lines[0] if lines else ""
     split = next((each for each in ";\t," if first.count(each) >= 3), None)
+    if split != ",":  # then commas are decimal ones
+        lines = [first, *(line.replace(",", ".") for line in lines[1:])]
     if not re.search("[a-zA-Z]", first):
         return _ASL, [line.split(split) for line in lines]
-    header = [name.strip() for name in first.lstrip("# ").split(split)]
+    header = [name.strip() for name in first.lstrip("#% ").split(split)]
     rows = [line.split(split) for line in lines[1:] if not line.startswith("#")]
     return header, rows
 
