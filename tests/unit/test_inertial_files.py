@@ -81,6 +81,18 @@ def test_decimal_commas(tmp_path: Path) -> None:
     assert found.accel_m_s2.tolist() == [ACCEL] * 100
 
 
+def test_dates_are_times(tmp_path: Path) -> None:
+    made: list[list[object]] = [
+        [f"2024-05-01T10:00:{0.01 * n:06.3f}Z", *GYRO, *ACCEL] for n in range(1, 101)
+    ]
+    made[50][0] = "yesterday"
+    found = read_csv(write(tmp_path / "a.csv", "timestamp,gx,gy,gz,ax,ay,az", made))
+    first_ns = 1_714_557_600_010_000_000
+    kept = [n for n in range(100) if n != 50]
+    assert found.imu.stamps_ns.tolist() == [first_ns + 10_000_000 * n for n in kept]
+    assert "1 damaged" in found.notes[0]
+
+
 def test_unit_of_accelerations_by_their_length(tmp_path: Path) -> None:
     made = [[0.01 * n, *GYRO, 0.0, 0.0, 1.01] for n in range(100)]
     found = read_csv(write(tmp_path / "a.csv", "t,gx,gy,gz,ax,ay,az", made))
