@@ -152,7 +152,7 @@ def numbers(
             at = _time(row[time])
             found = [float(row[column]) for column in wanted]
             usable = -_LATEST < at < _LATEST
-        except (InvalidOperation, ValueError, OverflowError, IndexError):  # also of a time that is no number
+        except (ArithmeticError, ValueError, IndexError):  # also of a time that is no number
             usable = False
             at, found = Decimal(0), []
         if not usable:
