@@ -153,6 +153,15 @@ def test_samples_with_gaps(walk: Motion) -> None:
     assert abs(found.metres_per_unit / UNIT_M - 1.0) < max(3.0 * found.scale_sigma, 0.01)
 
 
+def test_accelerations_of_the_opposite_sign(walk: Motion) -> None:
+    poses, samples = measured(walk, 4)
+    given = aligned(walk, poses, samples)
+    found = aligned(walk, poses, replace(samples, accel_m_s2=-samples.accel_m_s2))
+    assert (given.accel_sign, found.accel_sign) == (1.0, -1.0)
+    assert found.metres_per_unit == given.metres_per_unit
+    assert found.up.tolist() == given.up.tolist()
+
+
 def test_refuses_samples_of_another_motion(walk: Motion) -> None:
     poses, samples = measured(walk, 5)
     other = measured(hand_held(20.0, seed=9), 5)[1]

@@ -52,6 +52,9 @@ def test_asl_is_exact(tmp_path: Path, header: str) -> None:
          1.0, 57.29578, 1.0),
         ("timestamp,angular_velocity.x,angular_velocity.y,angular_velocity.z,"
          "linear_acceleration.x,linear_acceleration.y,linear_acceleration.z", 1e-9, 1.0, 1.0),
+        ("%time,field.angular_velocity.x,field.angular_velocity.y,field.angular_velocity.z,"
+         "field.linear_acceleration.x,field.linear_acceleration.y,field.linear_acceleration.z",
+         1e-9, 1.0, 1.0),
     ],
 )  # fmt: skip
 def test_names_and_units_of_the_header(
@@ -65,6 +68,29 @@ def test_names_and_units_of_the_header(
     assert found.stamps_ns == pytest.approx(1e7 * np.arange(100), abs=1)
     assert found.gyro_rad_s[3] == pytest.approx(GYRO, rel=1e-6)
     assert found.accel_m_s2[3] == pytest.approx(ACCEL, rel=1e-6)
+
+
+def test_decimal_commas(tmp_path: Path) -> None:
+    header = "Time (s);wx (rad/s);wy (rad/s);wz (rad/s);ax (m/s^2);ay (m/s^2);az (m/s^2)"
+    made: list[list[object]] = [
+        [str(x).replace(".", ",") for x in (0.01 * n, *GYRO, *ACCEL)] for n in range(100)
+    ]
+    found = read_csv(write(tmp_path / "a.csv", header, made, ";")).imu
+    assert found.stamps_ns == pytest.approx(1e7 * np.arange(100), abs=1)
+    assert found.gyro_rad_s.tolist() == [GYRO] * 100
+    assert found.accel_m_s2.tolist() == [ACCEL] * 100
+
+
+def test_dates_are_times(tmp_path: Path) -> None:
+    made: list[list[object]] = [
+        [f"2024-05-01T10:00:{0.01 * n:06.3f}Z", *GYRO, *ACCEL] for n in range(1, 101)
+    ]
+    made[50][0] = "yesterday"
+    found = read_csv(write(tmp_path / "a.csv", "timestamp,gx,gy,gz,ax,ay,az", made))
+    first_ns = 1_714_557_600_010_000_000
+    kept = [n for n in range(100) if n != 50]
+    assert found.imu.stamps_ns.tolist() == [first_ns + 10_000_000 * n for n in kept]
+    assert "1 damaged" in found.notes[0]
 
 
 def test_unit_of_accelerations_by_their_length(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ which there were digital cameras.
 
 import math
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 
@@ -31,6 +32,14 @@ def number_of(text: str, where: str) -> Decimal:
     if not value.is_finite() or value < 0:
         raise DatasetError(f"{where}: the time {text[:40]} is not finite and positive")
     return value
+
+
+def utc_ns(text: str) -> int:
+    """Nanoseconds since 1970 of a date in ISO 8601, in UTC without a zone.  Raises ValueError."""
+    time = datetime.fromisoformat(text.strip())
+    time = time if time.tzinfo is not None else time.replace(tzinfo=UTC)
+    since = time - datetime(1970, 1, 1, tzinfo=UTC)
+    return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
 
 
 def nanoseconds(value: Decimal, unit: str, where: str) -> int:

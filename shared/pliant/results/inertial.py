@@ -24,6 +24,8 @@ _REFUSALS = {
     CouplingOutcome.IMAGES_DISAGREE: "the reprojection errors would grow more than predicted",
     CouplingOutcome.CALIBRATION_FIXED: "the calibration is fixed",
 }
+_OTHER_CLOCK_S = 10.0
+"""Clocks that differ by more are not one clock with a delay: milliseconds would be unreadable."""
 
 
 def coupling_of(run: Run) -> dict[str, Any] | None:
@@ -52,13 +54,13 @@ def by_samples(history: MapHistory, samples: ImuSamples) -> Scale | str:
     found = align_inertial(poses.stamps_ns, poses.T_world_camera, samples)
     if isinstance(found, Refusal):
         return found.reason
+    offset_s = found.time_offset_s
+    offset = f"{1e3 * offset_s:+.1f} ms" if abs(offset_s) < _OTHER_CLOCK_S else f"{offset_s:+.3f} s"
+    negated = " with accelerations of the opposite sign" if found.accel_sign < 0.0 else ""
     return Scale(
         metres_per_unit=found.metres_per_unit,
         sigma=found.scale_sigma,
-        source=(
-            f"inertial samples of {found.seconds:.0f} s, {1e3 * found.time_offset_s:+.1f} ms from "
-            "the images"
-        ),
+        source=(f"inertial samples of {found.seconds:.0f} s{negated}, {offset} from the images"),
         level=level_of(upright(found.up), float(np.degrees(found.up_sigma_rad))),
     )
 

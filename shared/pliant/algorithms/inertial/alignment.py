@@ -56,8 +56,10 @@ class InertialAlignment:
     metres_per_unit: of the trajectory.   scale_sigma: as a share of it.   up: (3,) unit vector
     against gravity, in the trajectory's world; up_sigma_rad: of its direction.
     time_offset_s: t_imu - t_camera.   R_camera_imu, p_camera_imu: of the sensor, metres.
-    gyro_bias, accel_bias: (3,) means over time.   explained: of the camera's rotation by the gyro.
-    seconds: in which poses and samples were compared.
+    gyro_bias, accel_bias: (3,) means over time.   accel_sign: -1 if the samples' accelerations are
+    those of the camera less gravity, with the opposite sign: -9.81 upwards at rest.
+    explained: of the camera's rotation by the gyro.   seconds: in which poses and samples were
+    compared.
     """
 
     metres_per_unit: float
@@ -71,6 +73,7 @@ class InertialAlignment:
     p_camera_imu: F64
     gyro_bias: F64
     accel_bias: F64
+    accel_sign: float
     explained: float
     seconds: float
 
@@ -116,8 +119,15 @@ def align_inertial(
             f"the accelerometer shows {shown:.1f} m/s^2 on average instead of {GRAVITY_M_S2}: "
             "its unit is another, or its axes are not those of the gyro"
         )
-    found = _best(nodes, signal, rotation)
-    return _judged(found, nodes, rotation, extent)
+    for sign in (1.0, -1.0):
+        found = _best(nodes, replace(signal, accel=sign * signal.accel), rotation)
+        if found is not None and np.isfinite(_misfit(found)):
+            return _judged(found, sign, nodes, rotation, extent)
+    return Refusal(
+        "the accelerometer does not fit the camera's motion at any scale: samples of another "
+        "video, or hardly an acceleration (positions would be wrong by "
+        f"{NOISE_RANGE[1]:.0%} of the trajectory's extent)"
+    )
 
 
 def averaged_signal(samples: ImuSamples, origin_ns: int) -> ImuSignal:
@@ -263,14 +273,8 @@ def _start(nodes: Nodes, signal: ImuSignal, rotation: RotationAlignment) -> Stat
 
 
 def _judged(
-    found: Estimate | None, nodes: Nodes, rotation: RotationAlignment, extent: float
+    found: Estimate, accel_sign: float, nodes: Nodes, rotation: RotationAlignment, extent: float
 ) -> InertialAlignment | Refusal:
-    if found is None or not np.isfinite(_misfit(found)):
-        return Refusal(
-            "the accelerometer does not fit the camera's motion at any scale: samples of another "
-            "video, or hardly an acceleration (positions would be wrong by "
-            f"{NOISE_RANGE[1]:.0%} of the trajectory's extent)"
-        )
     # Blocks are few in a short clip: their spread alone would be small by chance.
     independent = np.diag(np.linalg.inv(found.information))
     sigmas = np.sqrt(np.maximum(np.diag(found.covariance), independent))
@@ -292,6 +296,7 @@ def _judged(
         p_camera_imu=state.p_camera_imu,
         gyro_bias=state.gyro_bias.mean(axis=0),
         accel_bias=state.accel_bias.mean(axis=0),
+        accel_sign=accel_sign,
         explained=rotation.explained,
         seconds=float(np.diff(nodes.times_s)[nodes.tied].sum()),
     )

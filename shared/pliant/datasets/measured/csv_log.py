@@ -25,7 +25,7 @@ from pliant.datasets.measured.base import (
     Series,
     imu_measurements,
 )
-from pliant.datasets.times import UNITS, likely_unit, nanoseconds
+from pliant.datasets.times import UNITS, likely_unit, nanoseconds, utc_ns
 from pliant.errors import DatasetError
 from pliant.wording import shown
 
@@ -130,9 +130,11 @@ def table_of(file: Path) -> tuple[list[str], list[list[str]]]:
     lines = [line.replace('"', "") for line in text_lines(file)]
     first = lines[0] if lines else ""
     split = next((each for each in ";\t," if first.count(each) >= 3), None)
+    if split != ",":  # then commas are decimal ones
+        lines = [first, *(line.replace(",", ".") for line in lines[1:])]
     if not re.search("[a-zA-Z]", first):
         return _ASL, [line.split(split) for line in lines]
-    header = [name.strip() for name in first.lstrip("# ").split(split)]
+    header = [name.strip() for name in first.lstrip("#% ").split(split)]
     rows = [line.split(split) for line in lines[1:] if not line.startswith("#")]
     return header, rows
 
@@ -140,14 +142,17 @@ def table_of(file: Path) -> tuple[list[str], list[list[str]]]:
 def numbers(
     rows: Sequence[Sequence[str]], time: int, wanted: Sequence[int]
 ) -> tuple[list[Decimal], F64, int]:
-    """Times and values (N, ``wanted``) of the lines that have them, and how many have not."""
+    """Times and values (N, ``wanted``) of the lines that have them, and how many have not.
+
+    A date is a time in seconds.
+    """
     times, values, unreadable = list[Decimal](), list[list[float]](), 0
     for row in rows:
         try:
-            at = Decimal(row[time])
+            at = _time(row[time])
             found = [float(row[column]) for column in wanted]
             usable = -_LATEST < at < _LATEST
-        except (InvalidOperation, ValueError, IndexError):  # also of a time that is no number
+        except (ArithmeticError, ValueError, IndexError):  # also of a time that is no number
             usable = False
             at, found = Decimal(0), []
         if not usable:
@@ -157,6 +162,14 @@ def numbers(
         values.append(found)
     table = np.array(values, float).reshape(-1, len(wanted))
     return times, np.where(np.abs(table) < _LARGEST, table, np.nan), unreadable
+
+
+def _time(text: str) -> Decimal:
+    """A number as it is written, or the seconds of a date.  Raises ValueError."""
+    try:
+        return Decimal(text)
+    except InvalidOperation:
+        return Decimal(utc_ns(text)).scaleb(-9)
 
 
 def stamps_of(

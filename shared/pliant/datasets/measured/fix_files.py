@@ -9,7 +9,6 @@
 
 import re
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -17,6 +16,7 @@ import numpy as np
 
 from pliant.datasets.measured.base import NOTHING, Measurements, Series, gps_measurements
 from pliant.datasets.measured.csv_log import numbers, stamps_of, table_of, text_lines, time_column
+from pliant.datasets.times import utc_ns
 from pliant.errors import DatasetError
 
 _NAN = float("nan")
@@ -54,7 +54,7 @@ def read_gpx(file: Path) -> Measurements:
             continue
         inside = {child.tag.rpartition("}")[2]: child.text or "" for child in point}
         try:
-            stamps.append(_utc_ns(inside["time"]))
+            stamps.append(utc_ns(inside["time"]))
             position = [float(point.attrib[name]) for name in ("lat", "lon")]
             values.append([*position, float(inside.get("ele", "nan")), _NAN, _NAN, _NAN])
         except (KeyError, ValueError, OverflowError):
@@ -133,11 +133,3 @@ def _position(text: str) -> list[float]:
     if place is None:
         return []
     return [float(place.group(2)), float(place.group(1)), float(place.group(3))]
-
-
-def _utc_ns(text: str) -> int:
-    """Nanoseconds since 1970.  Raises ValueError."""
-    time = datetime.fromisoformat(text.strip())
-    time = time if time.tzinfo is not None else time.replace(tzinfo=UTC)
-    since = time - datetime(1970, 1, 1, tzinfo=UTC)
-    return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000

@@ -168,6 +168,7 @@ def start_of(
     origin_ns, count = int(times_ns[0]), len(T)
     times_s = np.float64(1e-9) * (times_ns - origin_ns)
     signal = averaged_signal(timed.samples, origin_ns)
+    signal = replace(signal, accel=aligned.accel_sign * signal.accel)
     at = times_s[:chained] + aligned.time_offset_s
     tied = np.zeros(count - 1, np.bool_)
     covered = signal.covers(at[:-1] - _AROUND_S, at[1:] + _AROUND_S, longest_gap_s(signal))
