@@ -6,6 +6,7 @@ each time that their number has grown by a share.  Later frames use the new esti
 """
 
 import dataclasses
+from functools import cached_property
 
 import numpy as np
 
@@ -76,7 +77,7 @@ class SelfCalibration:
         covariance = np.diag(uncertainty.sigmas**2)
         return SelfCalibration(camera, np.zeros(SHARED), covariance, uncertainty=uncertainty)
 
-    @property
+    @cached_property
     def sigmas(self) -> F64:
         """(SHARED,) standard deviations of the correction."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
