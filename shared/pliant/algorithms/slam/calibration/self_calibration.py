@@ -6,7 +6,6 @@ each time that their number has grown by a share.  Later frames use the new esti
 """
 
 import dataclasses
-from functools import cached_property
 
 import numpy as np
 
@@ -77,7 +76,7 @@ class SelfCalibration:
         covariance = np.diag(uncertainty.sigmas**2)
         return SelfCalibration(camera, np.zeros(SHARED), covariance, uncertainty=uncertainty)
 
-    @cached_property
+    @property
     def sigmas(self) -> F64:
         """(SHARED,) standard deviations of the correction."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))

@@ -88,12 +88,12 @@ def seen_in_state(rows: I32, state: U8, wanted: int, seen: BoolArray, slot: int,
     for n in range(rows.size):
         if seen[slot, n] and state[rows[n]] == wanted:
             cameras = 0
-            for m in range(seen.shape[0] - 1, -1, -1):  # the newest are the likeliest
-                cameras += seen[m, n]
-                if cameras >= least:
-                    columns[count] = n
-                    count += 1
-                    break
+            if least > 1:
+                for m in range(seen.shape[0]):
+                    cameras += seen[m, n]
+            if least <= 1 or cameras >= least:
+                columns[count] = n
+                count += 1
     return columns[:count].copy()
 
 
