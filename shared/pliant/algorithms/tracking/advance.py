@@ -221,7 +221,7 @@ def _extremum_position(kappa: Pixels, pixel: int) -> tuple[np.float32, np.float3
     return u, v
 
 
-@fast_kernel
+@fast_kernel(inline=True)
 def _settle(kappa: Pixels, pixel: int, track: Track) -> None:
     """Put a track on an extremum of this frame."""
     u, v = _extremum_position(kappa, pixel)
@@ -232,7 +232,7 @@ def _settle(kappa: Pixels, pixel: int, track: Track) -> None:
     track.coasted = np.float32(0.0)
 
 
-@fast_kernel
+@fast_kernel(inline=True)
 def _find_extremum(
     kappa: Pixels, du: np.float32, dv: np.float32, limits: StepLimits, track: Track
 ) -> int:
@@ -254,7 +254,7 @@ def _find_extremum(
     return pixel
 
 
-@fast_kernel
+@fast_kernel(inline=True)
 def _follow_patch(
     image_before: Pixels,
     image: Pixels,
@@ -303,7 +303,7 @@ def _follow_patch(
     return bool(place.u < right) and bool(place.v < bottom)
 
 
-@fast_kernel
+@fast_kernel(inline=True)
 def _align_track(
     image: Pixels,
     start_u: np.float32,
@@ -330,7 +330,7 @@ def _align_track(
     return _Place(u, v, bool(accepted and fits))
 
 
-@fast_kernel
+@fast_kernel(inline=True)
 def _leads_back(
     image_before: Pixels,
     image: Pixels,

@@ -110,10 +110,10 @@ def turn_templates(
 def _deform(tracks: Tracks, slopes: F32, affine: F32, deformations: F32, lagging: I32) -> int:
     """Update the deformations.  Writes the rows with an outdated template; returns their number."""
     rows, columns = slopes.shape[0], slopes.shape[1]
-    lags = 0
+    flat, lags = deformations.reshape(-1), 0
     for i in range(len(tracks)):
         track = tracks[i]
-        prefetch(deformations.reshape(-1), tracks[min(i + 4 * AHEAD, len(tracks) - 1)].slot * 8)
+        prefetch(flat, tracks[min(i + 4 * AHEAD, len(tracks) - 1)].slot * 8)
         row = min(max(int(track.v) // CELL_PX, 0), rows - 1)
         column = min(max(int(track.u) // CELL_PX, 0), columns - 1)
         slope = slopes[row, column]

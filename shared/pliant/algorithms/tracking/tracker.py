@@ -27,7 +27,7 @@ from pliant.algorithms.tracking.dominant_flow import (
 from pliant.algorithms.tracking.local_flow import Flow, grid_shape, local_flow
 from pliant.algorithms.tracking.maxima import REACH_PX, curvature_and_maxima, uncovered
 from pliant.algorithms.tracking.parameters import TrackingParameters
-from pliant.algorithms.tracking.track_table import Tracks, TrackTable
+from pliant.algorithms.tracking.track_table import TRACK, Tracks, TrackTable
 from pliant.algorithms.tracking.upkeep import BirthLimits, compact, start_tracks
 from pliant.algorithms.tracks import FrameExtrema
 
@@ -148,7 +148,7 @@ class ExtremaTracker:
     ) -> None:
         table = self._table
         before = FrameImages(pixels_of(self._smooth), pixels_of(self._pyramid[0]))
-        tracks_before = table.tracks.copy()
+        tracks_before = table.tracks.view(np.uint8).copy().view(TRACK)  # by fields: 20 times slower
         advance_tracks(
             before,
             now,
