@@ -124,15 +124,16 @@ def fit_camera(
     equilibria: (N, 3) metres, world.  weights: (N,) DN^2 / m^2.  Returns T_camera_world.
     """
     w, x = weights * active, poses[:, X : X + 3]
-    W = w[:, None, None] * np.eye(3)
+    kept = np.tile(np.eye(3), (len(x), 1, 1))
     if across:
         rays = x / np.maximum(np.linalg.norm(x, axis=1), 1e-300)[:, None]
-        W = w[:, None, None] * (np.eye(3) - rays[:, :, None] * rays[:, None, :])
+        kept -= rays[:, :, None] * rays[:, None, :]
+    weighted = w[:, None, None] * kept
     for _ in range(_FIT_STEPS):
         points = transform(T_camera_world, equilibria)
         # A step rotates Sigma's axes, too: about the surfel's position, not its equilibrium.
         G = np.concatenate([np.tile(np.eye(3), (len(x), 1, 1)), -hat(x)], axis=2)
-        WG = W @ G
+        WG = weighted @ G
         M = np.einsum("nki,nkj->ij", G, WG)
         zeta = _solve(M, np.einsum("nki,nk->i", WG, x - points), 0.0)
         T_camera_world = se3_exp(zeta) @ T_camera_world
