@@ -165,3 +165,37 @@ def test_surfels_follow_a_window_in_its_unit() -> None:
     np.testing.assert_allclose(again.T_world_camera[:3, 3], placed[:3, 3], atol=3e-3)
     assert not follower.judge(WindowMap(problem="it is wrong"))
     assert not follower.deforms
+
+
+def test_windows_that_continue_each_other_keep_the_world_of_the_surfels() -> None:
+    """The newest camera of a window is its least certain: the next one must not be laid on it."""
+    motions = [np.eye(4), np.eye(4)]
+    renderer, camera = board_renderer(motions)
+    image, depth = renderer.frame(0, 0.0).image, renderer.frame(0, 0.0).depth_m
+    tracker = SurfelTracker(SurfelParameters(camera="moving", max_surfels=60))
+    follower, cameras = WindowFollower(), np.tile(np.eye(4), (4, 1, 1))
+    follower.note(0, 0, tracker.start(image, depth, camera))
+    for frame in (1, 2, 3):
+        surfels = tracker.track(image, STEP_S)
+        follower.note(frame, int(1e9 * frame * STEP_S), surfels)
+        if frame == 1:
+            continue
+        # Frame 2 is 0.03 off at first; the next window knows better.
+        cameras[2, 0, 3] = 0.03 if frame == 2 else 0.0
+        T = cameras[: frame + 1]
+        there = transform(inverse(surfels.T_world_camera), surfels.positions)
+        count = len(there)
+        window = WindowMap(
+            frames=np.arange(frame + 1),
+            T_world_camera=T.copy(),
+            ids=np.arange(count),
+            points_px=surfels.points_px.astype(np.float32),
+            rest=transform(T[-1], there),
+            displacements=np.zeros((frame + 1, 1, 3)),
+            carriers=np.zeros((count, 4), np.int64),
+            weights=np.full((count, 4), 0.25),
+        )
+        assert follower.judge(window)
+        follower.place(tracker, surfels, window)
+    found = tracker.add(image, np.zeros_like(depth))
+    np.testing.assert_allclose(found.T_world_camera, np.eye(4), atol=1e-3)

@@ -172,3 +172,16 @@ def test_camera_that_fits_the_surfels() -> None:
             zeta = np.zeros(6)
             zeta[k] = sign * 1e-3
             assert cost(se3_exp(zeta) @ found) > cost(found)
+
+
+def test_camera_that_fits_across_the_rays() -> None:
+    """Depths that no image determines turn the camera, unless only errors across rays count."""
+    poses = slanted_surfels(12, 4)
+    weights, active = np.full(12, 1e5), np.ones(12, np.uint8)
+    X0 = poses[:, X : X + 3].copy()
+    # All tilt, along their rays: no pixel changes.
+    poses[:, X : X + 3] *= 1.0 + 0.05 * X0[:, :1]
+    with_depths = fit_camera(poses, active, np.eye(4), X0, weights)
+    assert np.abs(with_depths - np.eye(4)).max() > 1e-3
+    across = fit_camera(poses, active, np.eye(4), X0, weights, across=True)
+    np.testing.assert_allclose(across, np.eye(4), atol=1e-9)

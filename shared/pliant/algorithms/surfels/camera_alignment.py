@@ -112,19 +112,30 @@ def _shift(before: F64, after: F64) -> F64:
     return np.linalg.norm(b[:, :2] / b[:, 2:] - a[:, :2] / a[:, 2:], axis=1)
 
 
-def fit_camera(poses: F64, active: U8, T_camera_world: F64, equilibria: F64, weights: F64) -> F64:
+def fit_camera(
+    poses: F64, active: U8, T_camera_world: F64, equilibria: F64, weights: F64,
+    *, across: bool = False,
+) -> F64:  # fmt: skip
     """Minimise Eq. 21 over the camera alone, which depends only on Eq. 20; no image is needed.
 
+    across: only errors across the rays count.  An image hardly determines depths: where all surfels
+    tilt a little, a camera that takes their depths for measured turns about the surface.
     poses: (N, POSE_FLOATS) in the camera's frame, fixed at their aligned values.
     equilibria: (N, 3) metres, world.  weights: (N,) DN^2 / m^2.  Returns T_camera_world.
     """
     w, x = weights * active, poses[:, X : X + 3]
+    kept = np.tile(np.eye(3), (len(x), 1, 1))
+    if across:
+        rays = x / np.maximum(np.linalg.norm(x, axis=1), 1e-300)[:, None]
+        kept -= rays[:, :, None] * rays[:, None, :]
+    weighted = w[:, None, None] * kept
     for _ in range(_FIT_STEPS):
         points = transform(T_camera_world, equilibria)
         # A step rotates Sigma's axes, too: about the surfel's position, not its equilibrium.
         G = np.concatenate([np.tile(np.eye(3), (len(x), 1, 1)), -hat(x)], axis=2)
-        M = np.einsum("n,nki,nkj->ij", w, G, G)
-        zeta = _solve(M, np.einsum("n,nki,nk->i", w, G, x - points), 0.0)
+        WG = weighted @ G
+        M = np.einsum("nki,nkj->ij", G, WG)
+        zeta = _solve(M, np.einsum("nki,nk->i", WG, x - points), 0.0)
         T_camera_world = se3_exp(zeta) @ T_camera_world
         depth = float(np.abs(points[:, 2]).mean())
         if np.abs(zeta[:3]).max() < _FITTED * depth and np.abs(zeta[3:]).max() < _FITTED:

@@ -24,27 +24,33 @@ _AROUND = 4
 @dataclass
 class WindowFollower:
     """deforms: whether the last window is trusted.    segment: of the surfels.
-    cameras: stamp, and T_world_camera (4, 4), of frames of that segment which a window may have,
-    since the last one that placed the camera."""
+    cameras: stamp, and T_world_camera (4, 4), of frames of that segment which a window may have.
+    from_start: whether they are all of the segment.    placed: T_world_camera (4, 4) by keyframe of
+    the last trusted window; after one that is not trusted, of its newest keyframe alone."""
 
     deforms: bool = False
     segment: int = 0
     cameras: dict[int, tuple[int, F64]] = field(default_factory=dict[int, tuple[int, F64]])
+    from_start: bool = True
+    placed: dict[int, F64] = field(default_factory=dict[int, F64])
 
     def note(self, frame: int, stamp_ns: int, surfels: SurfelFrame) -> None:
         """Remember a frame, which must have pixels."""
         if surfels.lost or surfels.segment != self.segment:  # another segment is another world
-            self.cameras, self.segment = {}, surfels.segment
+            self.cameras, self.placed, self.segment = {}, {}, surfels.segment
+            self.from_start = not surfels.lost and not surfels.age.any()
         if surfels.lost:
             return
         self.cameras[frame] = stamp_ns, surfels.T_world_camera.copy()
         for old in [n for n, (at, _) in self.cameras.items() if stamp_ns - at > SPAN_NS]:
             del self.cameras[old]
+            self.from_start = False
 
     def judge(self, found: WindowMap) -> bool:
         """Whether a frame has a window that is trusted."""
         if found.problem:
             self.deforms = False
+            self.placed = {frame: self.placed[frame] for frame in list(self.placed)[-1:]}
         is_trusted = len(found.frames) > 0
         self.deforms = self.deforms or is_trusted
         return is_trusted
@@ -52,19 +58,38 @@ class WindowFollower:
     def place(self, tracker: SurfelTracker, surfels: SurfelFrame, found: WindowMap) -> float:
         """Place the camera by a window; returns units of the surfels by one of the window.
 
-        surfels: in the newest keyframe, not lost.    The camera moves as in the window, since the
-        first of its keyframes that is known: if possible the last one that was placed so.
+        surfels: in the newest keyframe, not lost.    A window that continues a trusted one stays in
+        its world.  Another is laid on the surfels' camera where they started, which is exact, or
+        else on the mean of their later ones, whose errors go to and fro with the scene.
         """
         ratio = _ratio(found, surfels)
-        known = self.cameras if surfels.segment == self.segment else {}
-        rows = [row for row, frame in enumerate(found.frames.tolist()) if frame in known]
-        if rows:
-            motion = inverse(found.T_world_camera[rows[0]]) @ found.T_world_camera[-1]
-            motion[:3, 3] *= ratio
-            surfels = tracker.place(known[int(found.frames[rows[0]])][1] @ motion)
-        self.cameras = {}
+        cameras = found.T_world_camera.copy()
+        cameras[:, :3, 3] *= ratio
+        frames, same = found.frames.tolist(), surfels.segment == self.segment
+        placed = [row for row, frame in enumerate(frames) if same and frame in self.placed]
+        noted = [row for row, frame in enumerate(frames) if same and frame in self.cameras]
+        if placed:
+            rows, there = placed[:1], [self.placed[frames[placed[0]]]]
+        elif noted:
+            rows = noted[:1] if self.from_start else noted
+            there = [self.cameras[frames[row]][1] for row in rows]
+        else:
+            rows, there = [-1], [surfels.T_world_camera]
+        middle = ratio * found.rest.mean(axis=0)
+        cameras = _mean_motion(np.array(there) @ inverse(cameras[rows]), middle) @ cameras
+        self.placed = dict(zip(frames, cameras, strict=True))
+        surfels = tracker.place(cameras[-1])
         _settle(tracker, surfels, found, ratio)
         return ratio
+
+
+def _mean_motion(T: F64, middle: F64) -> F64:
+    """(4, 4) mean of motions (N, 4, 4) of things about ``middle`` (3,)."""
+    U, _, Vt = np.linalg.svd(T[:, :3, :3].mean(axis=0))
+    out = np.eye(4)
+    out[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    out[:3, 3] = transform(T.mean(axis=0), middle[None])[0] - out[:3, :3] @ middle
+    return out
 
 
 def _ratio(found: WindowMap, surfels: SurfelFrame) -> float:
