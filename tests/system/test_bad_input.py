@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from running import (
     NO_MESH,
+    TIMEOUT_S,
     TINY,
     UP,
     assert_one_line,
@@ -174,6 +175,16 @@ def test_output_without_a_reader_or_without_room() -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(command("config"), stdout=full, stderr=subprocess.PIPE, text=True)
     assert_one_line(done, "No space left")
+
+
+def test_closed_standard_streams(tmp_path: Path) -> None:
+    """A socket that got the number of stderr would get what libraries report."""
+    run = ["run", TINY, "--output", tmp_path / "run", *NO_MESH]
+    for arguments, closed in ((run, "<&- 2>&-"), (["config"], "<&- >&- 2>&-")):
+        shell = ["sh", "-c", f'exec "$@" {closed}', "sh", *command(*arguments)]
+        done = subprocess.run(shell, stdout=subprocess.PIPE, text=True, timeout=TIMEOUT_S)
+        assert done.returncode == 0, closed
+    assert (tmp_path / "run" / "trajectory.txt").exists()
 
 
 # -- frames that are broken -----------------------------------------------------------------------
