@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 from collections.abc import Generator, Sequence
 from pathlib import Path
 
@@ -185,6 +186,15 @@ def test_closed_standard_streams(tmp_path: Path) -> None:
         done = subprocess.run(shell, stdout=subprocess.PIPE, text=True, timeout=TIMEOUT_S)
         assert done.returncode == 0, closed
     assert (tmp_path / "run" / "trajectory.txt").exists()
+
+
+def test_modules_of_the_current_folder_are_not_imported(tmp_path: Path) -> None:
+    """The command does not import them, so neither do the processes that it starts."""
+    for name in ("signal", "json", "numpy"):
+        (tmp_path / f"{name}.py").write_text(f"raise SystemExit('{name}.py of the user')\n")
+    run = [sys.executable, "-P", "-m", "pliant_services.cli", "run", TINY, "--output", "run"]
+    done = subprocess.run([*run, *NO_MESH], cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
+    assert done.returncode == 0, done.stderr
 
 
 # -- frames that are broken -----------------------------------------------------------------------
