@@ -31,6 +31,7 @@ from pliant.messages.types import (
 )
 from pliant.recording.summary import SECOND_PASS, Summary
 from pliant.recording.writer import RecordingWriter
+from pliant.results.folder import STATE_FOLDER
 from pliant.results.report import rigid_report
 from pliant.results.run import Run
 from pliant.results.verdict import grade, summary
@@ -210,9 +211,11 @@ def test_the_summary_lists_files_with_their_sizes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     record(tmp_path, [""] * 3)
+    (tmp_path / STATE_FOLDER).mkdir()
+    (tmp_path / STATE_FOLDER / "0.state").write_bytes(bytes(10 << 20))  # removed after the summary
     pipeline._finish(tmp_path, interrupted=False, failure=None)
     first, second, *_ = capsys.readouterr().out.splitlines()
-    assert re.search(r"\(\d[\d.]* [KM]iB, of which the recording \d[\d.]* KiB\): traj", first)
+    assert re.search(r"\(\d[\d.]* KiB, of which the recording \d[\d.]* KiB\): traj", first)
     assert second == f"open in a browser: {tmp_path / 'report.html'}"
 
 

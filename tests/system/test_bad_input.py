@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 from collections.abc import Generator, Sequence
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from running import (
     NO_MESH,
+    TIMEOUT_S,
     TINY,
     UP,
     assert_one_line,
@@ -174,6 +176,25 @@ def test_output_without_a_reader_or_without_room() -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(command("config"), stdout=full, stderr=subprocess.PIPE, text=True)
     assert_one_line(done, "No space left")
+
+
+def test_closed_standard_streams(tmp_path: Path) -> None:
+    """A socket that got the number of stderr would get what libraries report."""
+    run = ["run", TINY, "--output", tmp_path / "run", *NO_MESH]
+    for arguments, closed in ((run, "<&- 2>&-"), (["config"], "<&- >&- 2>&-")):
+        shell = ["sh", "-c", f'exec "$@" {closed}', "sh", *command(*arguments)]
+        done = subprocess.run(shell, stdout=subprocess.PIPE, text=True, timeout=TIMEOUT_S)
+        assert done.returncode == 0, closed
+    assert (tmp_path / "run" / "trajectory.txt").exists()
+
+
+def test_modules_of_the_current_folder_are_not_imported(tmp_path: Path) -> None:
+    """The command does not import them, so neither do the processes that it starts."""
+    for name in ("signal", "json", "numpy"):
+        (tmp_path / f"{name}.py").write_text(f"raise SystemExit('{name}.py of the user')\n")
+    run = [sys.executable, "-P", "-m", "pliant_services.cli", "run", TINY, "--output", "run"]
+    done = subprocess.run([*run, *NO_MESH], cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
+    assert done.returncode == 0, done.stderr
 
 
 # -- frames that are broken -----------------------------------------------------------------------

@@ -26,6 +26,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "files": set(),
     "staging": {"files"},
     "exit_codes": set(),
+    "programs": set(),
     "version": set(),
     "wording": set(),
     "yaml_text": set(),
@@ -54,7 +55,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "fusion": {"fusion", "algorithms", "errors", "map_history"},
 }
 # They import nothing of ours; ``pliant`` is of the top.
-ANYWHERE = {"exit_codes", "version", "wording", "yaml_text"}
+ANYWHERE = {"exit_codes", "programs", "version", "wording", "yaml_text"}
 PURE_FORBIDS = {"time", "datetime", "socket", "logging", "os", "pathlib", "random", "threading"}
 
 

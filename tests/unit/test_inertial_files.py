@@ -106,6 +106,15 @@ def test_accelerations_without_gravity_are_refused(tmp_path: Path) -> None:
         read_csv(write(tmp_path / "a.csv", "t,gx,gy,gz,ax,ay,az", made))
 
 
+@pytest.mark.parametrize("value", ["nan", "inf", "1e300"])
+def test_accelerations_that_are_no_numbers_are_not_without_gravity(
+    tmp_path: Path, value: str
+) -> None:
+    made = [[0.01 * n, *GYRO, *[value] * 3] for n in range(10)]
+    with pytest.raises(DatasetError, match="none of its accelerations is a number"):
+        read_csv(write(tmp_path / "a.csv", "t,gx,gy,gz,ax,ay,az", made))
+
+
 def test_the_accelerations_with_gravity_are_chosen(tmp_path: Path) -> None:
     linear = [f"Linear Acceleration {axis} (m/s^2)" for axis in "xyz"]
     header = ",".join(["t,gx,gy,gz", *linear, "ax,ay,az"])
@@ -216,3 +225,11 @@ def test_a_named_file_replaces_them_or_is_refused(tmp_path: Path) -> None:
         found_of(folder, imu=str(tmp_path / "a.xyz"))
     with pytest.raises(DatasetError, match="no columns of latitude"):
         found_of(folder, gps=str(own))
+
+
+def test_a_device_is_no_table(tmp_path: Path) -> None:
+    endless = tmp_path / "a.csv"
+    endless.symlink_to("/dev/null")  # /dev/zero would fill the memory where this fails
+    source = SourceSpec(location="built-in:tiny", imu=str(endless))
+    with pytest.raises(DatasetError, match="not a kind of file that is understood"):
+        measurements_of(source, open_source(SourceSpec(location="built-in:tiny")))

@@ -9,7 +9,6 @@ import platform
 import select
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -21,6 +20,7 @@ from pliant import __version__
 from pliant.errors import PliantError
 from pliant.exit_codes import DONE, FAILED, INCOMPLETE
 from pliant.files import create
+from pliant.programs import PYTHON
 from pliant.results.folder import REPORT_NAME, STATE_FOLDER, is_being_written, settle_killed
 from pliant.results.verdict import grade
 
@@ -126,7 +126,7 @@ class OneRun:
 
     def __init__(self, arguments: list[str], log: Path, folder: Path) -> None:
         """arguments: of ``pliant run``.  Raises OSError if the log cannot be written."""
-        command = [sys.executable, "-m", "pliant_services.cli", "run", *arguments]
+        command = [*PYTHON, "-m", "pliant_services.cli", "run", *arguments]
         with create(log) as file:
             self._process = subprocess.Popen(
                 command,

@@ -71,6 +71,7 @@ _UsageError: type[typer.BadParameter] = next(
 
 def main(application: typer.Typer | None = None) -> None:
     """Run the command ``pliant``, or another with the same exit codes."""
+    _open_standard_streams()
     # A container stops by SIGTERM and a terminal that closes sends SIGHUP: both are a Ctrl-C.
     for kind in _INTERRUPTIONS:
         if signal.getsignal(kind) == signal.SIG_DFL:  # not under nohup
@@ -89,6 +90,21 @@ def main(application: typer.Typer | None = None) -> None:
         _leave_at_once(error)  # the interpreter would wait for threads that a failure left behind
     finally:
         _take_no_more()
+
+
+def _open_standard_streams() -> None:
+    """Connect those that are closed (``>&-``) to /dev/null.
+
+    Else Python has none of them, and the next file or socket gets the number of stderr: what any
+    library reports goes there.
+    """
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest number that is free: this one
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, mode, closefd=False))
 
 
 def _leave_at_once(error: BaseException) -> None:

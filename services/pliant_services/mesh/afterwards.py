@@ -12,6 +12,7 @@ from pathlib import Path
 from pliant.config import recorded_config
 from pliant.errors import PliantError
 from pliant.files import put_in_place
+from pliant.programs import PYTHON
 from pliant.recording.parts import PART, PART_RECORD, folder_of_parts, following_number
 from pliant.recording.reader import Recording
 from pliant.recording.summary import Summary, summarise
@@ -37,7 +38,7 @@ def add_mesh(output: Path) -> None:
         if not _can_be_meshed(summarise(output / RECORDING_NAME)):
             return
         process = subprocess.Popen(
-            [sys.executable, "-m", __name__, str(output)],
+            [*PYTHON, "-m", __name__, str(output)],
             stdin=subprocess.PIPE,  # never written: it closes when the launcher is gone
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from pliant.recording import parts
-from pliant.results.folder import PAGE_NAME, RECORDING_NAME, files_of
+from pliant.results.folder import PAGE_NAME, RECORDING_NAME, STATE_FOLDER, files_of
 from pliant.wording import counted
 
 
@@ -26,10 +26,11 @@ def print_summary(output: Path, report: dict[str, Any]) -> None:
 
 
 def _sizes(output: Path) -> str:
-    """How much room all of a result folder takes, and its recording."""
+    """How much room all of a result folder takes without its checkpoints, and its recording."""
     from pliant.recording.summary import in_words
 
-    every = sum(path.stat().st_size for path in output.rglob("*") if path.is_file())
+    kept = (path for path in output.rglob("*") if output / STATE_FOLDER not in path.parents)
+    every = sum(path.stat().st_size for path in kept if path.is_file())
     recorded = sum(path.stat().st_size for path in parts.parts_of(output / RECORDING_NAME))
     return f"{in_words(every)}, of which the recording {in_words(recorded)}"
 

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from pliant.errors import ResultError
+from pliant.programs import PYTHON
 from pliant_services.runtime.launcher import Fleet
 
 _WAIT_S = 120.0  # services compile before they are up; a viewer imports Rerun on a busy machine
@@ -52,7 +53,7 @@ class Viewer:
         Raises ResultError if it does not start.
         """
         command = [
-            *(sys.executable, "-m", "pliant_services.cli", "view"),
+            *(*PYTHON, "-m", "pliant_services.cli", "view"),
             *("--connect", fleet.endpoint, "--session", fleet.session, "--patience", str(_WAIT_S)),
             *self._where,
         ]

@@ -28,6 +28,8 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import IO, Any
 
+from pliant.programs import PYTHON
+
 _MODULE = "pliant_services.runtime.fork_server"
 _SET_CHILD_SUBREAPER = 36  # of prctl.h
 _LONGEST = 1 << 16
@@ -91,7 +93,7 @@ class ForkServer:
         with theirs:
             self._process = subprocess.Popen(
                 # The last word is room: forks show their own command line there.
-                [sys.executable, "-m", _MODULE, *services, " " * _SHOWN],
+                [*PYTHON, "-m", _MODULE, *services, " " * _SHOWN],
                 stdin=theirs.fileno(),  # it ends when the launcher is gone
                 stdout=subprocess.PIPE,  # as in its forks: Python asks once whether it can seek
                 stderr=subprocess.STDOUT,  # what is wrong, a service started as a program reports
@@ -212,7 +214,7 @@ def _become(arguments: Sequence[str], stdin: int, stdout: int) -> None:
     if not os.read(0, 1):
         os._exit(0)
     sys.argv = ["pliant", *arguments]
-    _show([sys.executable, "-m", "pliant_services.cli", *arguments])
+    _show([*PYTHON, "-m", "pliant_services.cli", *arguments])
 
 
 def _show(command: Sequence[str]) -> None:

@@ -13,6 +13,7 @@ import pliant
 from pliant import arithmetic
 from pliant.cache import cache_folder
 from pliant.errors import PliantError
+from pliant.programs import PYTHON
 from pliant_services.processes import BY_NAME, COMPILED
 
 
@@ -49,7 +50,7 @@ def start_compiler(service: str) -> subprocess.Popen[str]:
         f"from {BY_NAME[service].module} import warm_up; warm_up()"
     )
     return subprocess.Popen(
-        [sys.executable, "-c", code],
+        [*PYTHON, "-c", code],
         stdin=subprocess.PIPE,  # never written: it closes when the launcher is gone
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,

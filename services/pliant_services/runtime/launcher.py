@@ -8,7 +8,6 @@ Each exits once it has read everything, so no message is lost.
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Sequence
@@ -25,6 +24,7 @@ from pliant.errors import BusError, MessageError, PliantError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import Status
+from pliant.programs import PYTHON
 from pliant_services.processes import BY_NAME
 from pliant_services.runtime.child import Child, first_to_fail
 from pliant_services.runtime.fork_server import ForkServer
@@ -212,7 +212,7 @@ class Fleet:
             *self._arguments(name),
         ]
         process = self._server.start(arguments) or subprocess.Popen(
-            [sys.executable, "-m", "pliant_services.cli", *arguments],
+            [*PYTHON, "-m", "pliant_services.cli", *arguments],
             stdin=subprocess.PIPE,  # never written: it closes when the launcher is gone
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

@@ -15,6 +15,7 @@ from pliant.api.result import Result
 from pliant.config import Settings, overrides_of
 from pliant.errors import ResultError
 from pliant.exit_codes import DONE, INCOMPLETE
+from pliant.programs import PYTHON
 from pliant.recording import parts
 from pliant.results.folder import RECORDING_NAME, folder_name
 
@@ -91,7 +92,7 @@ def run(
         "camera": camera, "depth": depth, "depth-frames": depth_frames, "no-images": not images,
         "seed": seed, "poses": on_frame is not None,
     }  # fmt: skip
-    command = [sys.executable, "-m", "pliant_services.cli", "run"]
+    command = [*PYTHON, "-m", "pliant_services.cli", "run"]
     for name, value in options.items():
         if value is not None and value is not False:
             command += [f"--{name}"] if value is True else [f"--{name}", str(value)]

@@ -4,12 +4,12 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
 
 from pliant.errors import ResultError
+from pliant.programs import PYTHON
 
 LOOPBACK = "127.0.0.1"
 _UP_S = 60.0
@@ -33,7 +33,7 @@ class RerunProgram:
                     "another --web-port"
                 )
         self.ports = ports
-        command = [sys.executable, "-m", "rerun", "--bind", LOOPBACK, "--port", str(ports[0])]
+        command = [*PYTHON, "-m", "rerun", "--bind", LOOPBACK, "--port", str(ports[0])]
         self._process = subprocess.Popen(
             [*command, *arguments],
             stdin=subprocess.DEVNULL,

@@ -190,6 +190,8 @@ def in_m_s2(accel: F64, factor: float | None, where: Path | str) -> tuple[F64, s
     At rest an accelerometer measures gravity, and a camera that is held by hand, by a car or by a
     drone accelerates less than that most of the time.  Raises DatasetError if it is missing.
     """
+    if not np.isfinite(accel).all(axis=1).any():
+        raise DatasetError(f"{where}: none of its accelerations is a number")
     median, note = _median_length(accel), ""
     if factor is None:
         factor = likely_factor(accel)

@@ -36,7 +36,8 @@ _BESIDE: tuple[tuple[str, Reader], ...] = (
 
 def read_named(file: Path, readers: Mapping[str, Reader], option: str) -> Measurements:
     """The samples of a file that a user named by an option.  Raises DatasetError."""
-    reader = read_phone_log if is_phone_log(file) else readers.get(file.suffix.lower())
+    reader = readers.get(file.suffix.lower()) if file.is_file() else None  # a device has no end
+    reader = read_phone_log if is_phone_log(file) else reader
     if not file.exists():
         raise DatasetError(f"{option} {file}: no such file")
     if reader is None:
