@@ -1,8 +1,12 @@
 """Certificates and access control over real TLS links on loopback."""
 
+import ctypes
 import itertools
+import os
 import shutil
+import signal
 import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -119,6 +123,25 @@ def test_a_router_on_a_public_address_warns(host: str) -> None:
         router.terminate()
     warned = [line for line in said if "WARNING" in line and "pliant certs" in line]
     assert len(warned) == (host == "0.0.0.0")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads in /proc")
+def test_a_signal_that_another_thread_receives_ends_a_router() -> None:
+    router = subprocess.Popen(
+        command("router", "--listen", free_endpoint()), stderr=subprocess.PIPE, text=True
+    )
+    with router:
+        assert router.stderr is not None
+        assert any("router on" in line for line in router.stderr)
+        state = Path(f"/proc/{router.pid}/stat")
+        while state.read_text().rpartition(") ")[2].startswith("R"):
+            pass  # it is about to wait
+        threads = sorted(int(name) for name in os.listdir(f"/proc/{router.pid}/task"))
+        assert ctypes.CDLL(None).tgkill(router.pid, threads[1], signal.SIGTERM) == 0
+        try:
+            assert router.wait(timeout=60.0) == 0
+        finally:
+            router.kill()
 
 
 def test_which_endpoints_other_machines_reach() -> None:

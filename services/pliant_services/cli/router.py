@@ -33,8 +33,8 @@ def router(
 
     pliant router --listen tls/0.0.0.0:7447 --tls certs
     """
+    import os
     import signal
-    import threading
 
     from pliant.bus.peers import OVER_KEY
     from pliant.bus.session import Identity, is_beyond_loopback, open_router, session_name
@@ -43,13 +43,13 @@ def router(
     from pliant_services.security.access import access_control
     from pliant_services.security.certificates import ROUTER
 
-    stopped = threading.Event()
-
-    def on_signal(*_: object) -> None:
-        stopped.set()
-
+    # A pipe, as a signal that comes just before a lock is waited for, or to another thread, would
+    # not end that wait.
+    stopped, stop = os.pipe()
+    os.set_blocking(stop, False)
+    signal.set_wakeup_fd(stop)
     for kind in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(kind, on_signal)
+        signal.signal(kind, lambda *_: None)
     endpoints = listen or ["tcp/127.0.0.1:7447"]
     secure = tls is not None
     if sessions and not secure:
@@ -73,12 +73,12 @@ def router(
 
     def on_over(_: object) -> None:
         if once:
-            stopped.set()
+            os.write(stop, b"\0")
 
     held = session.declare_subscriber(f"pliant/*/{OVER_KEY}", on_over)
     typer.echo(f"router on {', '.join(endpoints)}", err=True)
     relays = Relays(session)
-    stopped.wait()
+    os.read(stopped, 1)
     relays.close()
     held.undeclare()
     session.close()  # type: ignore[no-untyped-call]
