@@ -48,8 +48,12 @@ def router(
     stopped, stop = os.pipe()
     os.set_blocking(stop, False)
     signal.set_wakeup_fd(stop)
+
+    def on_signal(*_: object) -> None:
+        """Nothing more: Python has written to the pipe."""
+
     for kind in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(kind, lambda *_: None)
+        signal.signal(kind, on_signal)
     endpoints = listen or ["tcp/127.0.0.1:7447"]
     secure = tls is not None
     if sessions and not secure:
