@@ -112,6 +112,22 @@ def test_the_camera_comes_back_from_another_segment(board: Film) -> None:
     assert (again.state == SurfelState.TRACKED).mean() > 0.9
 
 
+def test_a_map_of_one_segment_changes_no_other(board: Film) -> None:
+    frames, _ = board
+
+    def back(*, settled: bool) -> bytes:
+        tracker, _ = started(board, "moving")
+        there = tracker.track(frames[ELSEWHERE].image, STEP_S, depth=frames[ELSEWHERE].depth_m)
+        if settled:
+            rows = np.arange(len(there.ids))
+            tracker.settle(rows, there.positions, np.full(len(rows), 1e-3))
+        result = tracker.track(frames[AGAIN].image, STEP_S)
+        assert result.segment == 0
+        return result.T_world_camera.tobytes()
+
+    assert back(settled=True) == back(settled=False)
+
+
 def test_the_same_bytes_and_a_bound(board: Film) -> None:
     """However often tracking starts anew."""
     frames, _ = board

@@ -43,14 +43,14 @@ def router(
     from pliant_services.security.access import access_control
     from pliant_services.security.certificates import ROUTER
 
-    # A pipe, as a signal that comes just before a lock is waited for, or to another thread, would
-    # not end that wait.
+    # A pipe: the wait for a lock does not end if a signal comes just before it, or to another
+    # thread.
     stopped, stop = os.pipe()
     os.set_blocking(stop, False)
     signal.set_wakeup_fd(stop)
 
     def on_signal(*_: object) -> None:
-        """Nothing more: Python has written to the pipe."""
+        """Do nothing: Python has written to the pipe."""
 
     for kind in (signal.SIGINT, signal.SIGTERM):
         signal.signal(kind, on_signal)

@@ -56,8 +56,8 @@ class InertialAlignment:
     metres_per_unit: of the trajectory.   scale_sigma: as a share of it.   up: (3,) unit vector
     against gravity, in the trajectory's world; up_sigma_rad: of its direction.
     time_offset_s: t_imu - t_camera.   R_camera_imu, p_camera_imu: of the sensor, metres.
-    gyro_bias, accel_bias: (3,) means over time.   accel_sign: -1 if the samples' accelerations are
-    those of the camera less gravity, with the opposite sign: -9.81 upwards at rest.
+    gyro_bias, accel_bias: (3,) means over time.   accel_sign: -1 if the samples are the negative of
+    the specific force (at rest -9.81 m/s^2 upwards), otherwise 1.
     explained: of the camera's rotation by the gyro.   seconds: in which poses and samples were
     compared.
     """

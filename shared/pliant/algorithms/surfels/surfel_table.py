@@ -58,6 +58,7 @@ class SurfelTable:
     poses: F64 = field(default_factory=lambda: np.zeros((0, POSE_FLOATS)))  # last good ones
     rest: F64 = field(default_factory=lambda: np.zeros((0, 3)))  # X^0 of Eq. 20, world
     sigmas: F64 = field(default_factory=lambda: np.zeros(0))  # root of its Sigma, metres
+    settled: bool = False  # whether surfels rest where a map has them
     # At birth, at the exposure of the first frame: see ``brightness``.
     brightness: F64 = field(default_factory=lambda: np.zeros(0))
     ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -110,7 +111,8 @@ class SurfelTable:
         self.tried, self.rest = transform(T, self.tried), transform(T, self.rest)
 
     def settle(self, rows: I64, rest: F64, sigmas: F64) -> None:
-        """Change rest (R, 3) and sigmas (R,) of some rows."""
+        """Change rest (R, 3) and sigmas (R,) of some rows to those of a map."""
+        self.settled = True
         self.rest, self.sigmas = self.rest.copy(), self.sigmas.copy()
         self.rest[rows], self.sigmas[rows] = rest, sigmas
 

@@ -75,7 +75,6 @@ class SurfelTracker:
         self._frame, self._segment, self._segments, self._next_id = 0, 0, 0, 0
         self._interval_s, self._lost = 0.0, True
         self._lost_for_s = 0.0
-        self._settled = False  # whether the surfels rest where a map knows their places
         self._views = RememberedViews()
         self._earlier: dict[int, SurfelTable] = {}
 
@@ -90,7 +89,7 @@ class SurfelTracker:
         self._camera = camera
         self._table, self._frame, self._next_id = SurfelTable(), 0, 0
         self._segment = self._segments = 0
-        self._lost_for_s, self._settled = 0.0, False
+        self._lost_for_s = 0.0
         self._views, self._earlier = RememberedViews(), {}
         self._T_world_camera = np.eye(4) if T_world_camera is None else T_world_camera.copy()
         pyramid = self._pyramid(image)
@@ -161,7 +160,6 @@ class SurfelTracker:
         there (R,): Eq. 20.
         """
         self._table.settle(rows, rest, sigmas)
-        self._settled = True
 
     def _pyramid(self, image: U8) -> list[Level]:
         camera, p = self._camera, self._parameters
@@ -322,7 +320,7 @@ class SurfelTracker:
             if moving:
                 with timer("camera"):
                     T_camera_world = fit_camera(
-                        poses, guides, T_camera_world, table.rest, weights, across=self._settled
+                        poses, guides, T_camera_world, table.rest, weights, across=table.settled
                     )
         if moving:
             self._T_world_camera = inverse(T_camera_world)
@@ -441,7 +439,6 @@ class SurfelTracker:
             self._leave(table, self._segment)
             self._table = table = SurfelTable()
             self._segment = self._segments = self._segments + 1
-            self._settled = False
         if flat:  # the longest missing ones make room
             newest = np.argsort(table.missing, kind="stable")[: p.max_surfels - n]
             table.keep(np.sort(newest))

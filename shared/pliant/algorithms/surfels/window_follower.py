@@ -84,7 +84,7 @@ class WindowFollower:
 
 
 def _mean_motion(T: F64, middle: F64) -> F64:
-    """(4, 4) mean of motions (N, 4, 4) of things about ``middle`` (3,)."""
+    """Mean (4, 4) of rigid motions T (N, 4, 4) of what lies around ``middle`` (3,)."""
     U, _, Vt = np.linalg.svd(T[:, :3, :3].mean(axis=0))
     out = np.eye(4)
     out[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
