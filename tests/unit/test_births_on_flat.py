@@ -48,7 +48,7 @@ def test_surface_that_comes_into_view_gets_surfels() -> None:
     old = last.points_px[~new & (last.state == SurfelState.TRACKED)]
     gaps = np.abs(last.points_px[new][:, None] - old[None]).max(axis=2)
     assert gaps.min() > 14  # px, of a patch of 15
-    ends = new[tracker._table.edges.ends]
+    ends = new[tracker._now.table.edges.ends]
     assert (ends[:, 0] == ends[:, 1]).all()
     assert ends.any()
 

@@ -93,12 +93,12 @@ def test_a_search_that_leads_away_from_all_neighbours_is_refused() -> None:
     du, dv = u - first.points_px[row, 0], v - first.points_px[row, 1]
     shrunk = np.where(np.maximum(np.abs(du), np.abs(dv)) < 12, 1.0 / 1.3, 1.0).astype(np.float32)
     grown = cv2.remap(still, u - du + shrunk * du, v - dv + shrunk * dv, cv2.INTER_CUBIC)
-    table = made._table
+    table = made._now.table
     for image, refused in ((still, False), (grown, True)):
         table.state[row], table.renewed[row] = SurfelState.OUTLIER, True
-        for _ in range(5):  # a fifth of the surfels is searched in each frame
-            made._frame += 1
-            made._update_templates(made._pyramid(image))
+        pyramid = made._frames.pyramid(image, CAMERA)
+        for frame in range(5):  # a fifth of the surfels is searched in each
+            made._frames.update_templates(made._now, pyramid, frame)
         assert table.renewed[row] == refused
         np.testing.assert_allclose(table.poses[row, X + 2], 1.0, atol=0.01)
 

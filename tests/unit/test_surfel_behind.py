@@ -38,7 +38,7 @@ def start(
 
 def put(tracker: SurfelTracker, rows: I64, shift: tuple[float, float, float]) -> None:
     """Surfels are somewhere else than where they were born."""
-    table = tracker._table
+    table = tracker._now.table
     for poses in (table.poses, table.guesses):
         poses[rows, X : X + 3] += shift
     table.rest[rows] += shift
@@ -103,7 +103,7 @@ def test_a_camera_that_is_beyond_them(
     """The last pose of the camera is wrong by so much that all surfels are behind it: they are lost
     until the view is a known one."""
     tracker, _ = start(board, mode, neighbours)
-    tracker._T_world_camera = motion((0.0, 0.0, 0.0), (0.0, 0.0, 1.5))
+    tracker._now.T_world_camera = motion((0.0, 0.0, 0.0), (0.0, 0.0, 1.5))
     frame = tracker.track(mirrored(board[0][1].image), STEP_S)
     assert_finite(frame)
     assert frame.lost

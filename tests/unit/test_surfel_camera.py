@@ -77,7 +77,7 @@ def problem(seed: int = 0, count: int = 12) -> dict[str, object]:
     templates = make_templates(poses, level, 1e6, 0.5, EVERYWHERE, np.inf)
     rng = np.random.default_rng(seed)
     poses[:, X : X + 3] += 0.002 * rng.standard_normal((count, 3))
-    work, limits = make_workspace(23), tracker._limits(fine=True)
+    work, limits = make_workspace(23), tracker._frames.limits(fine=True)
     active = np.ones(count, np.uint8)
     matcher = Matcher(level, templates, limits, work)
     found = evaluate_all(poses, active, matcher)

@@ -21,7 +21,7 @@ def tracked_table(neighbours: int) -> SurfelTable:
     tracker = SurfelTracker(parameters)
     tracker.start(first.image, first.depth_m, camera)
     tracker.track(second.image, STEP_S)
-    return tracker._table
+    return tracker._now.table
 
 
 def confidence(table: SurfelTable) -> np.ndarray:
@@ -75,7 +75,7 @@ def test_on_made_up_depth_a_patch_that_is_distorted_otherwise_is_doubtful() -> N
     tracked = before.state == SurfelState.TRACKED
     assert before.confidence[tracked].min() > 0.9
     assert before.confirmed[tracked].all()
-    table = tracker._table
+    table = tracker._now.table
     row = int(np.argmin(np.linalg.norm(table.poses[:, X : X + 2], axis=1)))
     poses = table.poses.copy()
     poses[row, A : A + 3] *= 1.8

@@ -101,9 +101,9 @@ def test_batch_is_one_by_one(
     frames, camera, _ = board
     tracker = SurfelTracker(SMALL)
     tracker.start(frames[0].image, frames[0].depth_m, camera)
-    level = tracker._pyramid(frames[1].image)[0]
-    matcher = tracker._matcher(0, level)
-    start = tracker._table.poses
+    level = tracker._frames.pyramid(frames[1].image, camera)[0]
+    matcher = tracker._frames.matcher(tracker._now.table, 0, level)
+    start = tracker._now.table.poses
     together = start.copy()
     align_all(together, np.ones(len(start), np.uint8), no_equilibrium(len(start)), matcher)
     alone = start.copy()
@@ -121,14 +121,20 @@ def test_a_second_search_finds_surfels_moved_past_their_image(
     frames, camera, _ = board
     tracker = SurfelTracker(SMALL)
     tracker.start(frames[0].image, frames[0].depth_m, camera)
-    table, level = tracker._table, tracker._pyramid(frames[0].image)[0]
+    table, level = tracker._now.table, tracker._frames.pyramid(frames[0].image, camera)[0]
     n = len(table)
     off = table.poses.copy()
     off[:, X] += 1.2 / camera.fx * off[:, X + 2]
     wanted = (np.arange(n) % 2).astype(np.uint8)
     for strain, left in ((0.02, 0.5), (0.2, 0.25)):  # neighbours that hold less, let go
         found = off.copy()
-        relocate(found, wanted, table.edges, tracker._matcher(0, level), strain)
+        relocate(
+            found,
+            wanted,
+            table.edges,
+            tracker._frames.matcher(tracker._now.table, 0, level),
+            strain,
+        )
         np.testing.assert_array_equal(found[wanted == 0], off[wanted == 0])
         errors = np.linalg.norm((found - table.poses)[wanted > 0, X : X + 3], axis=1)
         assert np.median(errors) < left * 1.2 / camera.fx
@@ -270,7 +276,7 @@ def test_a_background_without_depth_is_no_part_of_the_texture(
     first = tracker.start(frozen, depth, camera)
     near = np.flatnonzero(first.points_px[:, 0] > 150 - 11)
     assert len(near)
-    background = tracker._table.templates[0].images[near, 0] > 1e6
+    background = tracker._now.table.templates[0].images[near, 0] > 1e6
     assert (background.sum(axis=1) > 0).all()
     result = tracker.track(shown, STEP_S)
     truth = transform(inverse(motions[1]), first.positions)
