@@ -76,14 +76,16 @@ def _judged(source: str) -> tuple[DeformingMapErrors | str, list[str]]:
         tracks.append((frame.index, found.ids, found.points_px.astype(np.float64)))
         if mapped.delta.state != TRACKING:
             continue
-        if window.take(frame.index, frame.stamp_ns, found.ids, found.points_px):
+        view = corrected_view(camera, ())
+        here = window.follow(found.ids, found.points_px, view)
+        if window.take(frame.index, frame.stamp_ns, found.ids, found.points_px, here):
             poses = {
                 n: pose_to_matrix(pose[None])[0]
                 for n, (segment, pose) in history.final().items()
                 if segment == mapped.delta.segment
             }
             begun_s = time.process_time()
-            windows.append(window.adjust(poses, corrected_view(camera, ())))
+            windows.append(window.adjust(poses, view))
             spent_s += time.process_time() - begun_s
     pipeline.finish()
     with tempfile.TemporaryDirectory() as folder:

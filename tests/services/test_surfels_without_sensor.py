@@ -8,7 +8,8 @@ import pytest
 from restarting import Restarted, Stopping
 
 from pliant.algorithms.arrays import F64, BoolArray
-from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.deformable.moving_landmarks import WindowMap
+from pliant.algorithms.geometry import inverse, pose_to_matrix, transform
 from pliant.algorithms.image.masks import packed
 from pliant.algorithms.surfels.remembered_views import RememberedViews
 from pliant.algorithms.surfels.surfel_frame import SurfelState
@@ -24,7 +25,9 @@ from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import (
     WAITING_FOR_DEPTH,
+    WORLD_FRAME_ID,
     CameraStream,
+    DeformingLandmarks,
     Depth,
     Extrema,
     Header,
@@ -111,6 +114,38 @@ def test_surfels_start_on_a_keyframe_of_our_own_map(everything: Messages) -> Non
     shares = true_depth(everything, first.frame)[row, column] / depth
     assert np.median(np.abs(shares / np.median(shares) - 1.0)) < 0.02
     assert np.count_nonzero(followed[-1].state == SurfelState.TRACKED) > 0.5 * len(first.ids)
+
+
+def test_the_first_window_is_laid_on_the_frame_in_which_surfels_started(
+    everything: Messages,
+) -> None:
+    """Which need be no keyframe of the window; later cameras of surfels may be wrong."""
+    config, made = load_config(None, FROM_MAP), without_depth(everything)
+    without = [m for m in follow(config, made, *OPTIONAL) if not m.missing]
+    first, last = without[0], without[-1]
+    T = np.stack([np.eye(4), first.T_world_camera, last.T_world_camera])
+    T[2, 0, 3] += 0.05
+    there = transform(inverse(last.T_world_camera), last.positions)
+    count = len(there)
+    window = DeformingLandmarks.of(
+        last,
+        WindowMap(
+            frames=np.array([first.frame - 1, last.frame]),
+            T_world_camera=T[[0, 2]],
+            ids=np.arange(count),
+            points_px=last.points_px,
+            rest=transform(T[2], there),
+            displacements=np.zeros((2, 1, 3)),
+            carriers=np.zeros((count, 4), np.int64),
+            weights=np.full((count, 4), 0.25),
+            between=np.array([first.frame]),
+            T_between=T[1:2],
+        ),
+        frame_id=WORLD_FRAME_ID,
+    )
+    windows = [*made[topics.MAP_DEFORMING][: last.frame], window]
+    placed = follow(config, {**made, topics.MAP_DEFORMING: windows}, *OPTIONAL)[-1]
+    np.testing.assert_allclose(placed.T_world_camera, T[2], atol=1e-3)
 
 
 def test_no_surfel_lies_under_a_mask(everything: Messages) -> None:

@@ -37,7 +37,9 @@ def windows(
     poses = {frame: pose_to_matrix(pose[None])[0] for frame, (_, pose) in placed.items()}
     window, out = DeformingWindow(), list[WindowMap]()
     for frame, ids, pixels in tracks(truth, rigid=rigid, still=still):
-        if window.take(frame, frame * STEP_NS, ids, pixels.astype(np.float32)):
+        points_px = pixels.astype(np.float32)
+        T = window.follow(ids, points_px, VIEW)
+        if window.take(frame, frame * STEP_NS, ids, points_px, T):
             out.append(window.adjust(poses, VIEW))
         if saved:
             window = load_state(save_state(window))
@@ -64,8 +66,8 @@ def test_each_second_has_a_map_of_the_last_three(
     truth: SurfaceTruth, found: list[WindowMap]
 ) -> None:
     assert [each.problem for each in found] == [""] * 7
-    assert [int(each.frames[-1]) for each in found] == [18, 28, 38, 48, 58, 68, 78]
-    assert [len(each.frames) for each in found] == [10] + [15] * 6
+    assert [int(each.frames[-1]) for each in found] == [10, 20, 30, 40, 50, 60, 70]
+    assert [len(each.frames) for each in found] == [6, 11] + [15] * 5
     for each in found:
         of_each = ratios(truth, each)
         assert len(of_each) > 300
@@ -84,6 +86,45 @@ def test_windows_continue_each_other(truth: SurfaceTruth, found: list[WindowMap]
         exact = truth.T_world_camera[after.frames[[first, -1]]]
         error = units[0] * motion[:3, 3] - (inverse(exact[0]) @ exact[1])[:3, 3]
         assert np.linalg.norm(error) < 0.01 * units[0] * np.median(np.abs(after.rest[:, 2]))
+
+
+def test_until_the_next_window_each_frame_is_placed_by_the_last(truth: SurfaceTruth) -> None:
+    """The surface breathes on, so its displacements are those of each frame."""
+    poses = {f: pose_to_matrix(p[None])[0] for f, (_, p) in rigid_map(truth).final().items()}
+    window, errors = DeformingWindow(), list[float]()
+    start, there, unit = -1, np.eye(4), 1.0
+    for frame, ids, pixels in tracks(truth):
+        points_px = pixels.astype(np.float32)
+        here = window.follow(ids, points_px, VIEW)
+        assert (here is None) == (start < 0)
+        if here is not None:
+            exact = (inverse(truth.T_world_camera[start]) @ truth.T_world_camera[frame])[:3, 3]
+            errors.append(float(np.linalg.norm(unit * (inverse(there) @ here)[:3, 3] - exact)))
+        if window.take(frame, frame * STEP_NS, ids, points_px, here):
+            found = window.adjust(poses, VIEW)
+            start, there = frame, found.T_world_camera[-1]
+            unit = float(np.median(ratios(truth, found)))
+    assert len(errors) == 69
+    assert np.sqrt(np.mean(np.square(errors))) < 0.007 * 0.6  # 0.6 m away
+    # Other tracks say nothing.
+    assert window.follow(np.arange(5000, 6000), np.zeros((1000, 2), np.float32), VIEW) is None
+
+
+def test_the_first_window_has_the_keyframes_of_the_rigid_map(truth: SurfaceTruth) -> None:
+    """Surfels start on one of them."""
+    poses = {f: pose_to_matrix(p[None])[0] for f, (_, p) in rigid_map(truth).final().items()}
+    window, found = DeformingWindow(), list[WindowMap]()
+    for frame, ids, pixels in tracks(truth)[:25]:
+        points_px = pixels.astype(np.float32)
+        if window.take(frame, frame * STEP_NS, ids, points_px, of_map=frame in (3, 13)):
+            found.append(window.adjust(poses, VIEW))
+    first, second = found
+    assert first.between.tolist() == [3]
+    assert not len(second.between)
+    unit = float(np.median(ratios(truth, first)))
+    motion = inverse(first.T_world_camera[0]) @ first.T_between[0]
+    exact = inverse(truth.T_world_camera[0]) @ truth.T_world_camera[3]
+    assert np.linalg.norm(unit * motion[:3, 3] - exact[:3, 3]) < 0.01 * 0.6
 
 
 def test_a_scene_that_is_rigid_or_a_camera_that_is_still_has_none(truth: SurfaceTruth) -> None:
@@ -159,6 +200,11 @@ def test_surfels_follow_a_window_in_its_unit() -> None:
     added = tracker.add(images[1], np.zeros_like(depth))
     np.testing.assert_allclose(added.T_world_camera, placed, atol=1e-9)
     np.testing.assert_allclose(added.points_px, second.points_px, atol=1e-3)
+    # So is the camera of a frame between two windows.
+    assert follower.camera(2, WindowMap()) is None
+    between = follower.camera(2, WindowMap(T_frame=T[1:]))
+    assert between is not None
+    np.testing.assert_allclose(between, placed, atol=1e-9)
     # The same image again: what is stiff keeps the camera where it is.
     again = tracker.track(images[1], STEP_S)
     np.testing.assert_array_equal(again.ids, second.ids)

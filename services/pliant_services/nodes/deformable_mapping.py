@@ -3,10 +3,11 @@
 in   camera/stream    once
      tracks/extrema   every frame
      map/update       every frame: the rigid map, from which each adjustment starts
-out  map/deforming    one per frame: with landmarks about once a second, where they can be trusted
+out  map/deforming    one per frame: with landmarks about once a second, where they can be trusted,
+                      and the camera of each frame since
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,17 +64,24 @@ def _take(state: _State, tracks: Extrema, update: MapUpdate, monitor: Monitor) -
         state.correction = update.calibration_correction
     if update.state != TRACKING:
         return WindowMap()
-    due = state.window.take(tracks.frame, tracks.stamp_ns, tracks.ids, tracks.points_px)
+    view = corrected_view(state.stream.camera, state.correction)
+    with monitor.stage("camera"):
+        T = state.window.follow(tracks.ids, tracks.points_px, view)
+    frame = np.zeros((0, 4, 4)) if T is None else T[None]
+    due = state.window.take(
+        tracks.frame, tracks.stamp_ns, tracks.ids, tracks.points_px, T,
+        of_map=tracks.frame in update.keyframe_frames,
+    )  # fmt: skip
     state.rigid.forget_before(state.window.keyframes[0].frame)
     if not due:
-        return WindowMap()
+        return WindowMap(T_frame=frame)
     poses = {
         frame: pose_to_matrix(pose[None])[0]
         for frame, (segment, pose) in state.rigid.final().items()
         if segment == update.segment
     }
     with monitor.stage("adjustment"):
-        return state.window.adjust(poses, corrected_view(state.stream.camera, state.correction))
+        return replace(state.window.adjust(poses, view), T_frame=frame)
 
 
 def warm_up() -> None:

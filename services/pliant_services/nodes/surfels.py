@@ -113,13 +113,15 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
                 interval_s = 1e-9 * (image.stamp_ns - state.stamp_ns)
                 prediction = _prediction(state, heard)
                 frame = state.tracker.track(image.grey, interval_s, prediction, metres)
+                frame = _place(state, heard, frame)
             if view is not None:
                 with monitor.stage("births"):
                     frame, note = _add(state, heard, frame, view, config)
-            state.follower.note(image.frame, image.stamp_ns, frame)
         elif not missing:
             with monitor.stage("start"):
                 frame, missing = _start(state, heard, metres, view, config)
+        if state.started and not missing:
+            state.follower.note(image.frame, image.stamp_ns, frame)
         if not heard.image.missing:
             state.stamp_ns = image.stamp_ns
             state.tracks, state.points_px = heard.tracks, frame.points_px
@@ -208,6 +210,14 @@ def _start(
         return SurfelFrame.empty(), f"{WAITING_FOR_DEPTH} where there is texture"
     state.started = True
     return frame, ""
+
+
+def _place(state: _State, heard: _Heard, frame: SurfelFrame) -> SurfelFrame:
+    """The frame with its camera by the last trusted window, if it has one."""
+    if heard.deforming is None or frame.lost:
+        return frame
+    T_world_camera = state.follower.camera(heard.frame, heard.deforming)
+    return frame if T_world_camera is None else state.tracker.place(T_world_camera)
 
 
 def _add(

@@ -52,7 +52,7 @@ from pliant.algorithms.deformable.node_graph import NodeGraph, no_nodes, node_gr
 from pliant.algorithms.deformable.priors import Prior
 from pliant.algorithms.geometry import so3_exp
 
-_NOISE_PX = 0.5
+NOISE_PX = 0.5
 """Standard deviation of a track."""
 _SPACING = 0.2
 """Between nodes, as a share of the median depth."""
@@ -191,7 +191,7 @@ class _Adjustment:
         r, squares = np.empty((count, 2)), np.empty(count)
         cost = linearise(
             *(t.keyframes, t.landmarks, t.points_px, self._intrinsics, state.T, state.rest),
-            *(state.d, self._graph.carriers, self._graph.weights, _NOISE_PX, KERNEL_PX),
+            *(state.d, self._graph.carriers, self._graph.weights, NOISE_PX, KERNEL_PX),
             *(J_camera, J_point, r, squares),
         )
         return _Linearised(J_camera, J_point, r, squares, cost)

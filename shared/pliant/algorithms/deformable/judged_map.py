@@ -19,10 +19,10 @@ TOO_FEW = "too few tracks through several keyframes determine it"
 _NO_JUDGES = "too few other tracks judge it"
 _FEWEST = 30
 """Tracks that judge it."""
-_CERTAIN, _PREDICTED, _GAIN, _STIFF = 0.65, 0.95, 0.6, 0.5
+_CERTAIN, _PREDICTED, _GAIN, _STIFF = 0.65, 0.95, 0.6, 0.3
 """Least share of certain landmarks, and least figures of the evidence.
 
-Scenes whose map is right have 0.79, 0.99, 0.7 and 0.6 or more.  Rigid scenes with an inexact
+Scenes whose map is right have 0.79, 0.98, 0.7 and 0.35 or more.  Rigid scenes with an inexact
 calibration have up to 0.83, 0.95, 0.5 and 1.0; with a camera that hardly moves 0.3, 1.0, 3 and 1.0.
 """
 

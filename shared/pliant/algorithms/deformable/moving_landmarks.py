@@ -67,6 +67,10 @@ class WindowMap:
     T_world_camera: theirs; the world is nearly that of the rigid map, the unit that of the first.
     ids, points_px: of the landmarks, where the newest keyframe tracks them, NaN where it does not.
     problem: why the adjustment is not to be trusted, "" where it is.
+    between, T_between: keyframes of the rigid map between those of a window that continues none,
+    and their T_world_camera.
+    T_frame: T_world_camera of this frame by the window before, in the world of that one; none where
+    none is trusted.
     """
 
     frames: Annotated[I64, Shape("K")] = field(default_factory=lambda: _no_rows())
@@ -80,6 +84,9 @@ class WindowMap:
     carriers: Annotated[I64, Shape("L", NEAREST)] = field(default_factory=lambda: _no_rows(NEAREST))
     weights: Annotated[F64, Shape("L", NEAREST)] = field(default_factory=lambda: _none(NEAREST))
     problem: str = ""
+    between: Annotated[I64, Shape("B")] = field(default_factory=lambda: _no_rows())
+    T_between: Annotated[F64, Shape("B", 4, 4)] = field(default_factory=lambda: _none(4, 4))
+    T_frame: Annotated[F64, Shape("F", 4, 4)] = field(default_factory=lambda: _none(4, 4))
 
     @property
     def in_view(self) -> I64:

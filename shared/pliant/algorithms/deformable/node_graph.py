@@ -48,11 +48,16 @@ def node_graph(rest: F64, spacing: float) -> NodeGraph:
     nodes = rest[chosen]
     if len(nodes) < NEAREST:
         raise ValueError(f"{len(nodes)} nodes: the landmarks are too close together")
+    carriers, weights = carriers_of(rest, nodes, spacing)
+    return NodeGraph(nodes, edges_of(nodes, spacing), carriers, weights, spacing)
+
+
+def edges_of(nodes: F64, spacing: float) -> I64:
+    """(E, 2) nodes that are joined."""
     near, apart = _nearest(nodes, nodes, min(_JOINED + 1, len(nodes)))
     pairs = np.stack([np.repeat(near[:, 0], near.shape[1] - 1), near[:, 1:].ravel()], axis=1)
     pairs = np.sort(pairs[apart[:, 1:].ravel() < _LONGEST * spacing], axis=1)
-    carriers, weights = carriers_of(rest, nodes, spacing)
-    return NodeGraph(nodes, np.unique(pairs, axis=0).reshape(-1, 2), carriers, weights, spacing)
+    return np.unique(pairs, axis=0).reshape(-1, 2)
 
 
 def carriers_of(points: F64, nodes: F64, spacing: float) -> tuple[I64, F64]:

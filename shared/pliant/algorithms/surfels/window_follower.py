@@ -23,16 +23,29 @@ _AROUND = 4
 
 @dataclass
 class WindowFollower:
-    """deforms: whether the last window is trusted.    segment: of the surfels.
+    """deforms: whether a trusted window has the frame.    segment: of the surfels.
     cameras: stamp, and T_world_camera (4, 4), of frames of that segment which a window may have.
     from_start: whether they are all of the segment.    placed: T_world_camera (4, 4) by keyframe of
-    the last trusted window; after one that is not trusted, of its newest keyframe alone."""
+    the last trusted window, and by frame since.    ratio, T_surfels_window: unit of the surfels by
+    that of this window, and then the motion (4, 4) between their worlds."""
 
     deforms: bool = False
     segment: int = 0
     cameras: dict[int, tuple[int, F64]] = field(default_factory=dict[int, tuple[int, F64]])
     from_start: bool = True
     placed: dict[int, F64] = field(default_factory=dict[int, F64])
+    ratio: float = 1.0
+    T_surfels_window: F64 = field(default_factory=lambda: np.eye(4))
+
+    def camera(self, frame: int, found: WindowMap) -> F64 | None:
+        """T_world_camera (4, 4) of a frame in the world of the surfels, if the last trusted window
+        has it."""
+        if not self.placed or not len(found.T_frame):
+            return None
+        here = found.T_frame[0].copy()
+        here[:3, 3] *= self.ratio
+        self.placed[frame] = self.T_surfels_window @ here
+        return self.placed[frame]
 
     def note(self, frame: int, stamp_ns: int, surfels: SurfelFrame) -> None:
         """Remember a frame, which must have pixels."""
@@ -45,38 +58,45 @@ class WindowFollower:
         for old in [n for n, (at, _) in self.cameras.items() if stamp_ns - at > SPAN_NS]:
             del self.cameras[old]
             self.from_start = False
+        if not self.from_start:
+            oldest = next(iter(self.cameras))
+            self.placed = {n: T for n, T in self.placed.items() if n >= oldest}
 
     def judge(self, found: WindowMap) -> bool:
         """Whether a frame has a window that is trusted."""
-        if found.problem:
-            self.deforms = False
-            self.placed = {frame: self.placed[frame] for frame in list(self.placed)[-1:]}
         is_trusted = len(found.frames) > 0
-        self.deforms = self.deforms or is_trusted
+        self.deforms = is_trusted or len(found.T_frame) > 0
         return is_trusted
 
     def place(self, tracker: SurfelTracker, surfels: SurfelFrame, found: WindowMap) -> float:
         """Place the camera by a window; returns units of the surfels by one of the window.
 
         surfels: in the newest keyframe, not lost.    A window that continues a trusted one stays in
-        its world.  Another is laid on the surfels' camera where they started, which is exact, or
-        else on the mean of their later ones, whose errors go to and fro with the scene.
+        its world: it is laid on the mean of their common cameras, without the newest, the least
+        certain.  Another is laid on the surfels' camera where they started, which is exact, or else
+        on the mean of their later ones, whose errors go to and fro with the scene.
         """
         ratio = _ratio(found, surfels)
         cameras = found.T_world_camera.copy()
         cameras[:, :3, 3] *= ratio
         frames, same = found.frames.tolist(), surfels.segment == self.segment
-        placed = [row for row, frame in enumerate(frames) if same and frame in self.placed]
-        noted = [row for row, frame in enumerate(frames) if same and frame in self.cameras]
+        of_frame = dict(zip(frames, cameras, strict=True))
+        between = found.T_between.copy()
+        between[:, :3, 3] *= ratio
+        every = of_frame | dict(zip(found.between.tolist(), between, strict=True))
+        placed = [frame for frame in frames if same and frame in self.placed]
+        noted = [frame for frame in sorted(every) if same and frame in self.cameras]
         if placed:
-            rows, there = placed[:1], [self.placed[frames[placed[0]]]]
+            pairs = [(self.placed[frame], of_frame[frame]) for frame in placed[:-1] or placed]
         elif noted:
-            rows = noted[:1] if self.from_start else noted
-            there = [self.cameras[frames[row]][1] for row in rows]
+            some = noted[:1] if self.from_start else noted
+            pairs = [(self.cameras[frame][1], every[frame]) for frame in some]
         else:
-            rows, there = [-1], [surfels.T_world_camera]
+            pairs = [(surfels.T_world_camera, cameras[-1])]
+        motions = np.array([there @ inverse(here) for there, here in pairs])
         middle = ratio * found.rest.mean(axis=0)
-        cameras = _mean_motion(np.array(there) @ inverse(cameras[rows]), middle) @ cameras
+        self.T_surfels_window = _mean_motion(motions, middle)
+        self.ratio, cameras = ratio, self.T_surfels_window @ cameras
         self.placed = dict(zip(frames, cameras, strict=True))
         surfels = tracker.place(cameras[-1])
         _settle(tracker, surfels, found, ratio)
