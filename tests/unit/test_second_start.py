@@ -115,6 +115,17 @@ def test_a_mapper_keeps_the_sample_only_while_the_camera_turns_in_place(turn):
     assert sampled_frames(slides) == 0
 
 
+def test_a_long_turn_with_many_keyframes_drops_the_sample(turn, monkeypatch):
+    mapper = Mapper(CAMERA, PARAMETERS, 0)
+    fed(mapper, turn[1][:60])
+    number = len(mapper.atlas.active.keyframes)
+    monkeypatch.setattr(track_sample, "_MOST_KEYFRAMES", number)
+    assert sampled_frames(mapper) == 60
+    fed(mapper, turn[1], 60)
+    assert len(mapper.atlas.active.keyframes) > number
+    assert sampled_frames(mapper) == 0
+
+
 def of_bytes(delta):
     return save_state(delta)
 

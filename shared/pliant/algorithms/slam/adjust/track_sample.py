@@ -39,6 +39,11 @@ _RAREST = 64
 determine the poses of its frames, some 3,400 of 10,000 tracks.
 """
 
+_MOST_KEYFRAMES = 256
+"""The sample is dropped with more.  Keyframes of a turn meet each other again and again, so their
+reduced system is dense, and takes the cube of their number: 450 of them take 90 s for one start.
+"""
+
 
 class SampledTracks(NamedTuple):
     """Tracks ids (n,) at points_px (n, 2) of the rectified image, in a frame."""
@@ -82,11 +87,13 @@ class TrackSample:
             self._size -= len(self.frames.pop(0).ids)
 
     def follow(self, keyframes: list[Keyframe]) -> None:
-        """Drop the sample once the camera of a segment's keyframes has moved too far.
+        """Drop the sample once a segment has too many keyframes, or their camera moved too far.
 
         Depths are those of keyframes that have left the window: young landmarks are uncertain.
         """
         done = [each for each in keyframes if _has_focus(each)]
+        if len(keyframes) > _MOST_KEYFRAMES:
+            self.drop()
         if not self.every or not done:
             return
         T_world_camera = np.array([keyframe.T_world_camera for keyframe in done])
