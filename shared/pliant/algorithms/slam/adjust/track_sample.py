@@ -41,7 +41,7 @@ determine the poses of its frames, some 3,400 of 10,000 tracks.
 
 _MOST_KEYFRAMES = 256
 """The sample is dropped with more.  Keyframes of a turn meet each other again and again, so their
-reduced system is dense, and takes the cube of their number: 450 of them take 90 s for one start.
+reduced system is dense, and takes the cube of their number: 490 of them take 75 s for one start.
 """
 
 
