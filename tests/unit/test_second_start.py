@@ -15,6 +15,7 @@ from pliant.algorithms.slam.adjust.second_start import (
     preference,
     second_map,
 )
+from pliant.algorithms.slam.adjust.segment import Moved
 from pliant.algorithms.slam.adjust.track_sample import SampledTracks, TrackSample, turns_in_place
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.estimate.problem import BundleParameters, CalibrationUncertainty
@@ -251,3 +252,26 @@ def test_a_preference_counts_what_is_independent():
     of_camera = np.repeat(np.arange(100, dtype=np.int32), 100)
     by_camera = np.repeat(generator.normal(0.1, 1.0, 100), 100)
     assert preference(by_camera, alone, of_camera) == pytest.approx(1.0, abs=1.5)
+
+
+def test_a_camera_that_stands_for_long_adds_few_frames():
+    poses = turning(240, 0.15 * DEPTH)
+    poses[60:] = poses[60]
+    mapper = Mapper(CAMERA, PARAMETERS, 0)
+    fed(mapper, list(around(3000, death=0.02).frames(poses)))
+    segment = mapper.atlas.active.segment
+    sampled = segment._sampled(mapper._sample)
+    assert len(mapper._sample.frames) == 240
+    assert len(sampled.numbers) <= 100
+    adjacent = np.diff(sampled.numbers) == 1
+    assert (np.append(adjacent, False) | np.insert(adjacent, 0, False)).all()  # for their motions
+
+
+def test_a_segment_that_joins_another_at_the_end_has_only_one_start(turn, monkeypatch):
+    tried = []
+    monkeypatch.setattr(second_start._Start, "adjusted", lambda *_: tried.append(1))
+    mapper = Mapper(CAMERA, PARAMETERS, 0)
+    fed(mapper, turn[1])
+    monkeypatch.setattr(mapper.atlas, "_join_met", lambda _: [Moved(np.eye(4))])
+    mapper.finish()
+    assert not tried

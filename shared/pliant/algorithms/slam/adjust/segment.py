@@ -50,6 +50,12 @@ from pliant.compiler.kernel import kernel
 
 _MIN_DEPTH = 1e-6
 
+_SAMPLED_PAIRS = 8
+"""Maximum pairs of successive frames on one reference keyframe, in the sample of a second start.  A
+camera that stands for a minute sees the same tracks in 1,800 frames: their system is dense, and
+takes the cube of their number.
+"""
+
 
 @dataclass(kw_only=True)
 class DroppedKeyframes:
@@ -368,22 +374,27 @@ class Segment:
         """The sample with the poses of its frames; None without one."""
         if not sample.frames:
             return None
-        slots = {keyframe.id: slot for slot, keyframe in enumerate(self.keyframes)}
-        frames, T_world_camera, _ = self.path.frames_on(self.keyframes)
-        poses = dict[int, tuple[int, F64]]()
-        for each, pose in zip(frames, T_world_camera, strict=True):
-            T_host_camera = inverse(each.keyframe.T_world_camera) @ pose
-            poses[each.frame] = slots[each.keyframe.id], T_host_camera
         seen_in = {each.frame for each in sample.frames}
-        poses = {frame: pose for frame, pose in poses.items() if frame in seen_in}
+        frames, T_world_camera, _ = self.path.frames_on(self.keyframes)
+        hosted = {keyframe.id: dict[int, F64]() for keyframe in self.keyframes}
+        for each, pose in zip(frames, T_world_camera, strict=True):
+            if each.frame in seen_in:
+                T_host_camera = inverse(each.keyframe.T_world_camera) @ pose
+                hosted[each.keyframe.id][each.frame] = T_host_camera
         own = np.array([keyframe.frame for keyframe in self.keyframes], np.int64)
+        poses = dict[int, tuple[int, F64]]()
+        for slot, on_one in enumerate(hosted.values()):
+            every = -(-len(on_one) // _SAMPLED_PAIRS)
+            for n, (frame, T_host_camera) in enumerate(on_one.items()):
+                if n % every < 2:
+                    poses[frame] = slot, T_host_camera
         poses |= {frame: (slot, np.eye(4)) for slot, frame in enumerate(own.tolist())}
         numbers = np.array(sorted(poses), np.int64)
-        hosted = [poses[number] for number in numbers.tolist()]
+        placed = [poses[number] for number in numbers.tolist()]
         return SampledFrames(
             numbers=numbers,
-            hosts=np.array([slot for slot, _ in hosted], np.int64),
-            T_host_camera=np.array([pose for _, pose in hosted]),
+            hosts=np.array([slot for slot, _ in placed], np.int64),
+            T_host_camera=np.array([pose for _, pose in placed]),
             keyframes=np.searchsorted(numbers, own),
             sampled=sample.frames,
         )
@@ -395,8 +406,7 @@ class Segment:
 
         Their observations of landmarks are those with the earlier readout, and are forgotten.
         """
-        self.ordinary.forget()
-        placed = {each.frame: each for each in frames}
+        placed, done = {each.frame: each for each in frames}, set[int]()
         limits, camera = parameters.localisation, known.view.camera
         for frame, keyframe, _ in self.path.frames_on(self.keyframes)[0]:
             each = placed.get(frame)
@@ -411,6 +421,8 @@ class Segment:
             if inliers >= limits.min_inliers:
                 pose = found.T_world_camera, inliers, found.information
                 self.path.refine(frame, keyframe, *pose)
+                done.add(frame)
+        self.ordinary.forget(done)
 
 
 @kernel

@@ -91,10 +91,10 @@ class TrackSample:
 
         Depths are those of keyframes that have left the window: young landmarks are uncertain.
         """
-        done = [each for each in keyframes if _has_focus(each)]
         if len(keyframes) > _MOST_KEYFRAMES:
             self.drop()
-        if not self.every or not done:
+        done = [each for each in keyframes if _has_focus(each)] if self.every else []
+        if not done:
             return
         T_world_camera = np.array([keyframe.T_world_camera for keyframe in done])
         positions = T_world_camera[:, :3, 3]

@@ -337,6 +337,8 @@ class Atlas:
         """
         with timer("merging"):
             moved = self._join_met(0)
+        if moved:
+            sample = None  # frames of the other segment are not in it
         active = self.active
         with timer("final adjustment"):
             moves = self._earlier.adjust(self._parameters, inertial)
