@@ -54,8 +54,8 @@ depth.
 """
 
 _FIRST = 3
-"""One sampled track of this number makes a first test: both starts by tracks alone, which takes a
-quarter of the time.  Ordinary maps end there.
+"""One in this many sampled tracks makes a first test: both starts by tracks alone, in a quarter of
+the time.  Ordinary maps end there.
 """
 
 _CERTAIN = 3.0
@@ -121,7 +121,7 @@ class Sightings:
     landmarks: int = 0
 
     def of_tracks(self, every: int) -> "Sightings":
-        """Return those of one track of this number."""
+        """Return those of one in this many tracks, and of no landmark."""
         some = self.point >= self.landmarks
         some &= (self.point - self.landmarks) % every == 0
         number = (self.point[some] - self.landmarks) // every

@@ -27,7 +27,7 @@ scene has an arm of one depth.
 """
 
 _EVERY = 8
-"""One track of this number is in the sample, by its id."""
+"""One in this many tracks is in the sample, by its id."""
 
 _ROOM = 1 << 19
 """Maximum stored observations, 8 MB: some 420 frames of 10,000 tracks.  With more, half of the
@@ -35,8 +35,8 @@ tracks leave the sample.
 """
 
 _RAREST = 64
-"""The sample is dropped when only one track of more than this number would be left: too few to
-determine the poses of its frames, some 3,400 of 10,000 tracks.
+"""The sample is dropped once only one in more than this many tracks would be left, after some 3,400
+frames of 10,000 tracks: too few to determine the poses of its frames.
 """
 
 _MOST_KEYFRAMES = 256
@@ -55,7 +55,7 @@ class SampledTracks(NamedTuple):
 
 @dataclass
 class TrackSample:
-    """frames: oldest first.   every: one track of this number is in it; 0: it has been dropped."""
+    """frames: oldest first.   every: one in this many tracks is in it; 0: it has been dropped."""
 
     every: int = _EVERY
     frames: list[SampledTracks] = field(default_factory=list[SampledTracks])
