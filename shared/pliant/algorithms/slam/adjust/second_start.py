@@ -55,7 +55,7 @@ depth.
 
 _FIRST = 3
 """One in this many sampled tracks makes a first test: both starts by tracks alone, in a quarter of
-the time.  Ordinary maps end there.
+the time.  Ordinary maps end there: all tracks together would hardly be certain.
 """
 
 _CERTAIN = 3.0
@@ -153,10 +153,11 @@ def second_map(
     arm_start = map_start._replace(known=given)
     arm = arm_start.on_arm(run)
     tracks = seen.of_tracks(_FIRST)
-    if not _costs_less(arm_start.adjusted(arm, tracks), map_start.adjusted(run, tracks), bundle):
+    first, second = map_start.adjusted(run, tracks), arm_start.adjusted(arm, tracks)
+    if not _is_better(second, first, tracks, bundle, _CERTAIN / np.sqrt(_FIRST)):
         return None
     first, second = map_start.adjusted(run, seen, xyz), arm_start.adjusted(arm, seen)
-    if not _costs_less(second, first, bundle) or not _is_preferred(second, first, seen, bundle):
+    if not _is_better(second, first, seen, bundle, _CERTAIN):
         return None
     return arm_start.map_of(second, seen)
 
@@ -286,18 +287,18 @@ class _Start(NamedTuple):
         )
 
 
-def _costs_less(second: BundleResult, first: BundleResult, bundle: BundleParameters) -> bool:
-    """Whether the second cost is lower, by more than what may be left to converge."""
-    return second.final_cost < (1.0 - bundle.min_relative_decrease) * first.final_cost
-
-
-def _is_preferred(
-    second: BundleResult, first: BundleResult, seen: Sightings, bundle: BundleParameters
-) -> bool:
-    """Whether tracks prefer the second map significantly."""
+def _is_better(
+    second: BundleResult, first: BundleResult, seen: Sightings, bundle: BundleParameters,
+    certain: float,
+) -> bool:  # fmt: skip
+    """Whether the second cost is lower, by more than what may be left to converge, and the tracks
+    prefer the second map by this number of standard deviations.
+    """
+    if not second.final_cost < (1.0 - bundle.min_relative_decrease) * first.final_cost:
+        return False  # also of costs that are not finite
     tracks = seen.point >= seen.landmarks
     gain = _costs(first, seen, bundle) - _costs(second, seen, bundle)
-    return preference(gain[tracks], seen.point[tracks], seen.camera[tracks]) > _CERTAIN
+    return preference(gain[tracks], seen.point[tracks], seen.camera[tracks]) > certain
 
 
 def _costs(found: BundleResult, seen: Sightings, bundle: BundleParameters) -> F64:
