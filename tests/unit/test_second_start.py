@@ -1,6 +1,7 @@
 """A camera that turns in one place: the sample of its tracks, and the choice between two maps."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from mapped_scene import PARAMETERS, run, trajectory_error
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 
 from pliant.algorithms.geometry import align_umeyama, inverse
-from pliant.algorithms.slam.adjust import second_start, track_sample
+from pliant.algorithms.slam.adjust import final_adjustment, second_start, track_sample
 from pliant.algorithms.slam.adjust.second_start import (
     SampledFrames,
     Sightings,
@@ -154,6 +155,20 @@ def test_the_second_map_is_published_as_a_whole(turn, monkeypatch):
     assert len(second.points) > 0.9 * len(first.points)
 
 
+def test_a_changing_focal_length_is_undone_by_a_second_map(turn, monkeypatch):
+    sure = SimpleNamespace(calls_for_more=True, confirmed_by=lambda *_, **__: True)
+    monkeypatch.setattr(final_adjustment, "evidence_of_change", lambda *_: sure)
+    first, second = Mapper(CAMERA, PARAMETERS, 0), Mapper(CAMERA, PARAMETERS, 0)
+    for mapper in (first, second):
+        fed(mapper, turn[1])
+    first.finish()
+    assert first.calibration.changes
+    monkeypatch.setattr(second_start, "_is_better", lambda *_: True)
+    second.finish()
+    assert not second.calibration.changes
+    assert all(keyframe.log_focal == 0.0 for keyframe in second.atlas.active.keyframes)
+
+
 def test_a_camera_that_slides_has_only_one_start(monkeypatch):
     tried = []
     monkeypatch.setattr(second_start._Start, "adjusted", lambda *_: tried.append(1))
@@ -165,9 +180,16 @@ def test_a_camera_that_slides_has_only_one_start(monkeypatch):
 class Turn:
     """Landmarks in every 8th frame of a turn, and tracks in all, which last for 10 frames."""
 
-    def __init__(self, seed=0):
+    def __init__(self, seed=0, zoom=0.0):
+        """zoom: change of the log focal length, there and back."""
         self.poses = turning(60, 0.15 * DEPTH)
         tracks = list(around(3000, noise_px=0.5, death=0.1, seed=seed).frames(self.poses))
+        log_focal, centre = zoom * np.sin(np.arange(60) / 10.0), np.array([CAMERA.cx, CAMERA.cy])
+        tracks = [
+            replace(t, points_px=(centre + f * (t.points_px - centre)).astype(np.float32))
+            for t, f in zip(tracks, np.exp(log_focal), strict=True)
+        ]
+        self.log_focal = log_focal[::8]
         own = np.arange(0, len(tracks), 8)
         camera = np.repeat(own, [len(tracks[m].ids) for m in own]).astype(np.int32)
         ids = np.concatenate([tracks[m].ids for m in own])
@@ -199,13 +221,14 @@ class Turn:
         T[:, :3, 3] = arm * T[:, :3, 2]
         return start.adjusted(T, seen)
 
-    def second(self, found):
+    def second(self, found, log_focal=0.0):
         own, hosts = self.frames.keyframes, self.frames.hosts
         T = found.T_world_camera
         frames = self.frames._replace(T_host_camera=inverse(T[own])[hosts] @ T)
         known = self.known.corrected(found.correction, found.covariance, len(own))
         xyz = found.points_world[: self.landmarks.points]
-        return second_map(frames, T[own], xyz, self.landmarks, known, BUNDLE, DEPTH)
+        log_focal = np.broadcast_to(log_focal, len(own))
+        return second_map(frames, T[own], xyz, self.landmarks, known, BUNDLE, DEPTH, log_focal)
 
     def error(self, T_world_camera):
         true = self.poses[self.frames.keyframes, :3, 3]
@@ -239,6 +262,21 @@ def test_a_right_map_stays():
     assert turn.second(turn.map_from(0.15 * DEPTH)) is None
 
 
+def test_a_focal_length_that_really_changes_keeps_its_map():
+    turn = Turn(zoom=0.05)
+    still = Turn()
+    assert turn.second(still.map_from(0.15 * DEPTH), turn.log_focal) is None
+
+
+def test_a_wrong_map_is_left_even_if_a_changing_focal_length_explains_it_better():
+    turn = Turn()
+    wrong = turn.map_from(-0.15 * DEPTH)
+    changes = 0.005 * np.random.default_rng(0).normal(size=len(turn.frames.keyframes))
+    second = turn.second(wrong, changes)
+    assert second is not None
+    assert abs(second.correction[0]) < 0.02
+
+
 def test_a_preference_counts_what_is_independent():
     generator = np.random.default_rng(0)
     gain = generator.normal(0.1, 1.0, 10_000)
@@ -260,7 +298,7 @@ def test_a_camera_that_stands_for_long_adds_few_frames():
     segment = mapper.atlas.active.segment
     sampled = segment._sampled(mapper._sample)
     assert len(mapper._sample.frames) == 240
-    assert len(sampled.numbers) <= 100
+    assert len(sampled.numbers) <= 60 + 2 * 32
     adjacent = np.diff(sampled.numbers) == 1
     assert (np.append(adjacent, False) | np.insert(adjacent, 0, False)).all()  # for their motions
 

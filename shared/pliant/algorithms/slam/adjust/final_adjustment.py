@@ -214,10 +214,11 @@ def adjust_keyframes(
     known = known.corrected(found.correction, found.covariance, len(keyframes))
     known = replace(known, changes=bool(len(found.log_focal)), log_focal=float(seen.log_focal[-1]))
     second = None
-    if sampled is not None and timed is None and not known.changes:
+    if sampled is not None and timed is None:
         second = _second_start(seen, sampled, known, parameters)
     if second is not None:
         known = known.corrected(second.correction, second.covariance, len(keyframes))
+        known = replace(known, changes=False, log_focal=0.0)
         _take_over(seen, second, before)
     view = known.view
     ids = np.array([keyframe.id for keyframe in keyframes], np.int64)
@@ -255,12 +256,14 @@ def _second_start(
     )  # fmt: skip
     depth = float(np.median(seen.medians(seen.depths(), seen.camera)))
     return second_map(
-        sampled, seen.T_world_camera, seen.xyz, landmarks, known, parameters.bundle, depth
-    )
+        sampled, seen.T_world_camera, seen.xyz, landmarks, known, parameters.bundle, depth,
+        seen.log_focal,
+    )  # fmt: skip
 
 
 def _take_over(seen: ObservationList, second: SecondMap, view: CorrectedView) -> None:
     seen.T_world_camera, seen.xyz = second.T_world_camera, second.xyz
+    seen.log_focal = 0.0 * seen.log_focal
     if seen.flow is not None:
         seen.flow = readout_flow(
             seen.T_world_camera, second.motions, seen.xyz, seen.camera, seen.point, seen.px,

@@ -10,7 +10,7 @@ map were removed, and few tracks reach the next keyframe.  So the sample of trac
 (``track_sample``) takes part: one adjustment of all landmarks and tracks, with all frames as
 cameras, from two starts:
 
-- the map as it is, with its calibration;
+- the map as it is, with its calibration, and the changes of its focal length, if any;
 - its rotations with the camera at the end of an arm along its axis, all points at the median depth,
   and the given calibration.
 
@@ -134,12 +134,13 @@ class Sightings:
 
 def second_map(
     frames: SampledFrames, T_world_keyframe: F64, xyz: F64, landmarks: Sightings,
-    known: SelfCalibration, bundle: BundleParameters, depth: float,
+    known: SelfCalibration, bundle: BundleParameters, depth: float, log_focal: F64,
 ) -> SecondMap | None:  # fmt: skip
     """Return the map from the second start, or None if the map of the run is as good.
 
     T_world_keyframe: (M, 4, 4) and xyz (N, 3): the map.   landmarks: their observations by
     keyframes.   known: the calibration of the map.   depth: median depth of the landmarks.
+    log_focal: (M,) of the keyframes.
     """
     if not turns_in_place(T_world_keyframe, depth):
         return None
@@ -152,11 +153,13 @@ def second_map(
     given = replace(known, correction=np.zeros(SHARED))
     arm_start = map_start._replace(known=given)
     arm = arm_start.on_arm(run)
+    by_run = _focused(frames, seen, known, log_focal)
     tracks = seen.of_tracks(_FIRST)
-    first, second = map_start.adjusted(run, tracks), arm_start.adjusted(arm, tracks)
+    first = map_start.adjusted(run, by_run.of_tracks(_FIRST))
+    second = arm_start.adjusted(arm, tracks)
     if not _is_better(second, first, tracks, bundle, _CERTAIN / np.sqrt(_FIRST)):
         return None
-    first, second = map_start.adjusted(run, seen, xyz), arm_start.adjusted(arm, seen)
+    first, second = map_start.adjusted(run, by_run, xyz), arm_start.adjusted(arm, seen)
     if not _is_better(second, first, seen, bundle, _CERTAIN):
         return None
     return arm_start.map_of(second, seen)
@@ -184,6 +187,15 @@ def _with_tracks(frames: SampledFrames, landmarks: Sightings, known: SelfCalibra
         points=landmarks.points + int(several.sum()),
         landmarks=landmarks.points,
     )
+
+
+def _focused(
+    frames: SampledFrames, seen: Sightings, known: SelfCalibration, log_focal: F64
+) -> Sightings:
+    """Return the observations as of a camera with a constant focal length.   log_focal: (M,)."""
+    numbers = frames.numbers.astype(np.float64)
+    each = np.interp(numbers, numbers[frames.keyframes], log_focal)
+    return replace(seen, px=known.view.magnified(seen.px, -each[seen.camera]))
 
 
 class _Start(NamedTuple):
