@@ -50,9 +50,9 @@ from pliant.compiler.kernel import kernel
 
 _MIN_DEPTH = 1e-6
 
-_SAMPLED_PAIRS = 16
+_SAMPLED_PAIRS = 4
 """Maximum pairs of successive frames on one reference keyframe, in the sample of a second start.  A
-camera that stands for a minute sees the same tracks in 1,800 frames: their system is dense, and
+camera that turns slowly, or stands, sees the same tracks in many frames: their system is dense, and
 takes the cube of their number.
 """
 
