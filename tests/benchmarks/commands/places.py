@@ -61,7 +61,7 @@ def second_pass(
 ) -> None:
     """What `--quality high` recovers, and its cost, in this process.
 
-    scripts/bench second-pass path/to/tum_fr1_rpy_first360
+    scripts/bench second-pass path/to/tum_fr1_rpy_first360 --set seed=1
     """
     from benchmarks.second_pass import measure
     from pliant.config import load_config

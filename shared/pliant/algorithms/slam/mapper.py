@@ -30,6 +30,7 @@ from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment
 from pliant.algorithms.slam.adjust.inertial_adjustment import Coupling
 from pliant.algorithms.slam.adjust.ordinary_frames import STANDING_ROOMS
 from pliant.algorithms.slam.adjust.segment import InertialSource, Moved, PlacedFrames, Segment
+from pliant.algorithms.slam.adjust.track_sample import TrackSample
 from pliant.algorithms.slam.atlas.atlas import Atlas
 from pliant.algorithms.slam.atlas.pose_history import PoseHistory
 from pliant.algorithms.slam.atlas.publisher import Publisher
@@ -85,6 +86,7 @@ class Mapper:
         self._generator = np.random.default_rng(seed)
         self._motion = Motion.at(0, 0, np.eye(4))  # in the active segment
         self._turns = FrameTurns()
+        self._sample = TrackSample()  # of the active segment, or of the one that may start
         self._samples: list[ImuSamples] = []
         self._couplings: list[Coupling] = []
         self._lost_frames = 0
@@ -105,6 +107,7 @@ class Mapper:
     def take(self, frame: Frame, timer: StageTimer = no_stages) -> Outcome:
         """Localise a frame and extend the map."""
         self._poses.expect(frame)
+        self._sample.add(frame.number, frame.extrema)
         ideal = self._catch_up(frame, timer)
         located = self._locate(ideal, timer)
         active = self.atlas.active
@@ -133,6 +136,7 @@ class Mapper:
         """Localise a frame as ``only_localise`` does."""
         active, found = self.atlas.active, None
         self._poses.expect(frame)
+        self._sample.add(frame.number, frame.extrema)
         self._keyframe_is_new = False
         if active is not None and not self._lost_frames:
             self._predict(active, frame)
@@ -163,7 +167,7 @@ class Mapper:
         if self._samples:
             samples, stamps_ns = joined(self._samples), self._poses.stamps_ns
             inertial = InertialSource(samples, stamps_ns, self._couplings, placed)
-        self.follow(self.atlas.finish(timer, inertial))
+        self.follow(self.atlas.finish(timer, inertial, self._sample))
         with timer("skipped frames"):
             for segment, seen_by in self.atlas.everything():
                 self._poses.refine(segment, segment.ordinary.take_all(), seen_by)
@@ -201,6 +205,8 @@ class Mapper:
         if place is not None:
             if self.atlas.active is not None:
                 self.journal.settle(self.atlas.active.keyframes)
+            if self.atlas.active is None or self.atlas.segment != place.keyframe.segment:
+                self._sample.drop()  # earlier frames of the segment are not in it
             self.atlas.resume(place.keyframe, frame.tracks.ids)
             self._motion = Motion.at(frame.number, frame.stamp_ns, place.T_world_camera)
             self._recognised = place.keyframe.id
@@ -212,6 +218,7 @@ class Mapper:
     def _start(self, frame: IdealFrame, timer: StageTimer) -> Outcome:
         """There is no map: start one, if the frames so far allow it."""
         self._waiting.add(frame)
+        self._sample.begin_at(self._waiting.numbers[0])
         with timer("start"):
             started = self._waiting.start_map()
         if isinstance(started, str):
@@ -240,7 +247,7 @@ class Mapper:
         if long and self._lost_frames >= _LEAST_LOST:
             self.journal.settle(active.keyframes)
             self.atlas.leave()
-            self._lost_frames = 0
+            self._lost_frames, self._sample = 0, TrackSample()
         return outcome
 
     def _flaw(self, frame: IdealFrame) -> str:
@@ -292,6 +299,7 @@ class Mapper:
             if frame.rolled is not None:
                 active.segment.to_global_shutter(active.window.keyframes, self.calibration)
             keyframe = active.insert_keyframe(placed)
+            self._sample.follow(active.keyframes)
         self.follow(self.atlas.calibrate())
         self._keyframe_ns = frame.stamp_ns
         if self._recognised is not None:
@@ -344,6 +352,7 @@ class Mapper:
                 self.journal.move(each.moves)
             if each.gone is not None:
                 self.journal.join(each.gone, self.atlas.segment)
+                self._sample.drop()
             self.journal.add_same_places(each.same_places)
 
     def start_at_last(self) -> bool:

@@ -10,6 +10,7 @@ from pliant.algorithms.geometry import lengths
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.slam.adjust.loops import Loop
 from pliant.algorithms.slam.adjust.segment import InertialSource, Segment
+from pliant.algorithms.slam.adjust.track_sample import TrackSample
 from pliant.algorithms.slam.adjust.window import Window
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.frame import IdealFrame, PlacedFrame
@@ -421,10 +422,11 @@ class ActiveMap:
         return S
 
     def adjust_all(
-        self, known: SelfCalibration, inertial: InertialSource | None = None
-    ) -> tuple[SelfCalibration, MapMoves | None]:
+        self, known: SelfCalibration, inertial: InertialSource | None = None,
+        sample: TrackSample | None = None,
+    ) -> tuple[SelfCalibration, MapMoves | None]:  # fmt: skip
         """As ``Segment.adjust``."""
-        known, moves = self.segment.adjust(known, self.parameters, inertial)
+        known, moves = self.segment.adjust(known, self.parameters, inertial, sample)
         self.seen_by = known
         self.rebuild_window()
         self._place_candidates()  # their positions are those before the adjustment

@@ -18,6 +18,13 @@ from pliant.algorithms.slam.adjust.inertial_adjustment import (
     TimedSamples,
     with_samples,
 )
+from pliant.algorithms.slam.adjust.second_start import (
+    SampledFrames,
+    SecondMap,
+    SecondPose,
+    Sightings,
+    second_map,
+)
 from pliant.algorithms.slam.calibration.changing_focal import evidence_of_change, gaps_s, walk_from
 from pliant.algorithms.slam.calibration.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.slam.calibration.focal_search import best_along_focal
@@ -179,15 +186,17 @@ def adjust_keyframes(
     parameters: MappingParameters,
     motions: F64,
     timed: TimedSamples | None = None,
-) -> tuple[SelfCalibration, I32, MapMoves]:
+    sampled: SampledFrames | None = None,
+) -> tuple[SelfCalibration, I32, MapMoves, list[SecondPose]]:
     """Adjust all but the first keyframe, their landmarks and the calibration by Schur LM.
 
     Outlying observations are removed, and the landmarks' statistics updated.  The keyframes' pixels
     become those of the estimated camera, except for the readout.
     known: of the camera, whose pixels the keyframes have.    motions: (M, 6) of the keyframes, see
-    ``FramePoses``.    timed: inertial samples.    Returns the new calibration, the
-    rows of landmarks that are at infinity or seen by too few keyframes, and how the map around each
-    keyframe moves.
+    ``FramePoses``.    timed: inertial samples.    sampled: tracks of all frames, which may show a
+    better map from a second start.    Returns the new calibration, the rows of landmarks that are
+    at infinity or seen by too few keyframes, how the map around each keyframe moves, and new poses
+    of other frames, which a second start has.
     """
     given, before = known, known.view
     seen = list_observations(keyframes, points, known)
@@ -204,11 +213,18 @@ def adjust_keyframes(
     )  # fmt: skip
     known = known.corrected(found.correction, found.covariance, len(keyframes))
     known = replace(known, changes=bool(len(found.log_focal)), log_focal=float(seen.log_focal[-1]))
+    second = None
+    if sampled is not None and timed is None:
+        second = _second_start(seen, sampled, known, parameters)
+    if second is not None:
+        known = known.corrected(second.correction, second.covariance, len(keyframes))
+        known = replace(known, changes=False, log_focal=0.0)
+        _take_over(seen, second, before)
     view = known.view
     ids = np.array([keyframe.id for keyframe in keyframes], np.int64)
     moves = moves_between(ids, poses, seen.T_world_camera, seen.scales(depths))
     if seen.flow is not None:
-        seen.px = seen.px - (found.correction[3] * seen.flow).astype(np.float32)
+        seen.px = seen.px - (known.correction[3] * seen.flow).astype(np.float32)
     seen.px = view.pixels(view.magnified(seen.px, -seen.log_focal[seen.camera]))
     points.move_to(seen.rows, seen.xyz)
     for slot, keyframe in enumerate(keyframes):
@@ -224,7 +240,35 @@ def adjust_keyframes(
         )  # fmt: skip
         keyframe.rolled_px = np.zeros_like(keyframe.points_px)
     far = at_infinity(seen.xyz, keyframes[0].T_world_camera[:3, 3])
-    return known, seen.rows[(count < 2) | far], moves
+    frames = [] if second is None else second.frames
+    return known, seen.rows[(count < 2) | far], moves, frames
+
+
+def _second_start(
+    seen: ObservationList, sampled: SampledFrames, known: SelfCalibration,
+    parameters: MappingParameters,
+) -> SecondMap | None:  # fmt: skip
+    counts = np.bincount(seen.point, minlength=len(seen.rows))
+    kept = _spread_out(seen.point, counts, MOST_SEEN)
+    landmarks = Sightings(
+        camera=sampled.keyframes[seen.camera[kept]].astype(np.int32), point=seen.point[kept],
+        px=seen.px.compress(kept, 0), weights=seen.weights[kept], points=len(seen.rows),
+    )  # fmt: skip
+    depth = float(np.median(seen.medians(seen.depths(), seen.camera)))
+    return second_map(
+        sampled, seen.T_world_camera, seen.xyz, landmarks, known, parameters.bundle, depth,
+        seen.log_focal,
+    )  # fmt: skip
+
+
+def _take_over(seen: ObservationList, second: SecondMap, view: CorrectedView) -> None:
+    seen.T_world_camera, seen.xyz = second.T_world_camera, second.xyz
+    seen.log_focal = 0.0 * seen.log_focal
+    if seen.flow is not None:
+        seen.flow = readout_flow(
+            seen.T_world_camera, second.motions, seen.xyz, seen.camera, seen.point, seen.px,
+            view.camera,
+        )  # fmt: skip
 
 
 def adjust_list(

@@ -97,9 +97,10 @@ class OrdinaryFrames:
             )
         )  # fmt: skip
 
-    def forget(self) -> None:
-        """Leave the frames where they are: their observations are no longer valid."""
-        self._keep([])
+    def forget(self, frames: set[int] | None = None) -> None:
+        """Leave these frames, or all, where they are: their observations are no longer valid."""
+        kept = [] if frames is None else [f for f in self._frames if f.frame not in frames]
+        self._keep(kept)
 
     def seen_by(self, before: CorrectedView, after: CorrectedView) -> None:
         """Convert the pixels to those of another ideal camera."""

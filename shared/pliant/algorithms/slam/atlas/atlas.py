@@ -20,6 +20,7 @@ from pliant.algorithms.slam.active.active_map import ActiveMap
 from pliant.algorithms.slam.active.frame_focal import refocused
 from pliant.algorithms.slam.adjust.global_adjustment import AdjustmentResult, GlobalAdjustment, held
 from pliant.algorithms.slam.adjust.segment import InertialSource, Moved, Segment, see_by
+from pliant.algorithms.slam.adjust.track_sample import TrackSample
 from pliant.algorithms.slam.atlas.known_places import KnownPlaces, SegmentMerges, join
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration, is_guess
 from pliant.algorithms.slam.frame import IdealFrame
@@ -310,10 +311,13 @@ class Atlas:
         self.global_adjustment = GlobalAdjustment()  # the running job is of the map before
         return [self._adjust(active)]
 
-    def _adjust(self, active: ActiveMap, inertial: InertialSource | None = None) -> Moved:
+    def _adjust(
+        self, active: ActiveMap, inertial: InertialSource | None = None,
+        sample: TrackSample | None = None,
+    ) -> Moved:  # fmt: skip
         newest = active.keyframes[-1]
         before = newest.T_world_camera
-        self.calibration, moves = active.adjust_all(self.calibration, inertial)
+        self.calibration, moves = active.adjust_all(self.calibration, inertial, sample)
         self._adjusted = True
         published = None if moves is None else held(moves, self._spans, self.segment)
         return Moved(newest.T_world_camera @ inverse(before), published)
@@ -323,14 +327,18 @@ class Atlas:
         self.global_adjustment, self.places.meetings = GlobalAdjustment(), SegmentMerges()
 
     def finish(
-        self, timer: StageTimer = no_stages, inertial: InertialSource | None = None
-    ) -> list[Moved]:
+        self, timer: StageTimer = no_stages, inertial: InertialSource | None = None,
+        sample: TrackSample | None = None,
+    ) -> list[Moved]:  # fmt: skip
         """Apply the remaining corrections at the end of the stream.
 
-        inertial: samples that the poses are to agree with.
+        inertial: samples that the poses are to agree with.   sample: of the tracks in the frames of
+        the active segment.
         """
         with timer("merging"):
             moved = self._join_met(0)
+        if moved:
+            sample = None  # frames of the other segment are not in it
         active = self.active
         with timer("final adjustment"):
             moves = self._earlier.adjust(self._parameters, inertial)
@@ -340,7 +348,7 @@ class Atlas:
         with timer("merging"):
             moved += self._close_at_last(active)
         with timer("final adjustment"):
-            return [*moved, *self._adjust_at_last(active, inertial)]
+            return [*moved, *self._adjust_at_last(active, inertial, sample)]
 
     def _close_at_last(self, active: ActiveMap) -> list[Moved]:
         """Close the loops that are still open."""
@@ -351,12 +359,14 @@ class Atlas:
         result = self.global_adjustment.settle()
         return [] if result is None else self.take_over(result)
 
-    def _adjust_at_last(self, active: ActiveMap, inertial: InertialSource | None) -> list[Moved]:
+    def _adjust_at_last(
+        self, active: ActiveMap, inertial: InertialSource | None, sample: TrackSample | None
+    ) -> list[Moved]:
         """Adjust the last active segment in the frame of its beginning."""
         back = active.segment.back()
         moved = [] if back is None else [self.move(held(back, self._spans, self.segment))]
         active.collect_garbage()
-        return [*moved, self._adjust(active, inertial)]
+        return [*moved, self._adjust(active, inertial, sample)]
 
     def note_changed(self, journal: Journal, *, everything: bool) -> None:
         """Tell the journal which keyframes and landmarks may need to be published.
