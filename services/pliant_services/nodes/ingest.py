@@ -98,8 +98,6 @@ def run(
     begin, dropped, broken, *kept, sent = resume(bus, start)
     if sent != checksum:  # taken up again with another file
         clip = None
-    if live:
-        bus.wait_until_read(topics.STREAM)  # no image is passed over because a reader starts
     pace, drops = MappingPace(*kept[0]), Drops(*kept[1])
     image: Image | None = None
     counters: dict[str, float] = {}

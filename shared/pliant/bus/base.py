@@ -57,10 +57,6 @@ class Bus(Protocol):
         """
         ...
 
-    def wait_until_read(self, topic: Topic) -> None:
-        """Block until all readers of a topic are here."""
-        ...
-
     def wait_until_taken(self, topic: Topic) -> None:
         """Block until all readers of a topic, but those that may lag, have taken all of it."""
         ...

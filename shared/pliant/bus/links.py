@@ -241,10 +241,9 @@ class OutLink:
                 self.box.refused += 1
                 return
             left = shared.peers.left(reader)
-            is_first = reader in self.box.silent()  # what came before it was lost
             came_back = self.box.credit(reader, incarnation, taken, safe, left, received=received)
             is_old = request == IF_OLD and received < self.sent_at_tick
-            is_requested = is_first or came_back or request == NOW or is_old
+            is_requested = came_back or request == NOW or is_old
             if is_requested and received < self.box.sent:
                 self.box.asking.add(reader)
                 shared.wake.set()

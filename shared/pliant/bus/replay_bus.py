@@ -82,9 +82,6 @@ class ReplayBus:
         """None: there is time for everything."""
         return 0
 
-    def wait_until_read(self, topic: Topic) -> None:
-        """Nothing is awaited."""
-
     def wait_until_taken(self, topic: Topic) -> None:
         """Nothing: there is time for everything."""
 

@@ -61,14 +61,14 @@ class Waits:
     spent_s: dict[str, float] = field(default_factory=dict[str, float])
 
     def for_readers(self, output: OutLink, lacking: Callable[[], list[str]]) -> None:
-        """Wait while a reader, here or not, lacks something.  Raises BusError."""
+        """Wait while there is a reader that is not here or lacks something.  Raises BusError."""
         readers = output.box.readers.keys()
         with self.changed:
             while True:
                 self.peers.raise_if_refused()
                 here = self.peers.seen(readers)
-                names = lacking()
-                if not names:
+                names = lacking() if here else self.peers.missing(readers)
+                if here and not names:
                     self.now.end()
                     return
                 began = time.monotonic()

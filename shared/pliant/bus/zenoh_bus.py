@@ -7,9 +7,9 @@ will never request again.  A sender never has more than a window on the way to i
 reader, and keeps messages that may be requested.  A reader requests missing messages.  So each
 message is taken exactly once, in order, and memory is bounded.
 
-Who starts first does not matter: a sender begins when it is ready, and sends what a reader that
-comes later has missed, at most a window.  A reader subscribes, then declares a liveliness token.  A
-peer that stays away for longer than our patience is named in an error, so that every wait ends.
+Who starts first does not matter: readers subscribe, then declare a liveliness token; a sender waits
+for the tokens of its required readers before its first message.  A peer that stays away for longer
+than our patience is named in an error, so that every wait ends.
 
 With checkpoints a service that died continues where it was: ``restore`` puts it back to the newest
 checkpoint that its readers allow.  Senders repeat what came after it, and readers skip messages
@@ -202,11 +202,6 @@ class ZenohBus:
         """Wait until all readers, but those that may lag, have taken all that was sent."""
         output = self._outputs[topic.key]
         self._waits.for_readers(output, output.box.behind)
-
-    def wait_until_read(self, topic: Topic) -> None:
-        """Wait until all readers of a topic are here."""
-        output = self._outputs[topic.key]
-        self._waits.for_readers(output, output.box.silent)
 
     def publish(
         self,
