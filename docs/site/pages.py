@@ -8,7 +8,6 @@ import posixpath
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass
-from importlib import import_module
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from pliant.config import describe
 from pliant.messages.codec import scalars
 from pliant.messages.topics import TOPICS, Topic, status
 from pliant.messages.types import Header
-from pliant_services.cli import app
+from pliant_services.cli.commands import app
 from pliant_services.cli.groups import GROUPS, grouped_options
 from pliant_services.processes import PROCESSES
 
@@ -101,7 +100,6 @@ def _notebook(path: Path) -> str:
 
 def _commands() -> str:
     """Every command as the command line has it."""
-    import_module("pliant_services.cli.commands")  # registers them
     group: Any = typer.main.get_command(app)
     parts = ["# Commands", "What `--help` of each says.", *_prose(group.help)]
     for heading in GROUPS:

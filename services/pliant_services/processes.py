@@ -115,6 +115,12 @@ BY_NAME = {process.name: process for process in PROCESSES}
 COMPILED = tuple(process.name for process in PROCESSES if process.kernels)
 
 
+def in_order_of_start(services: Sequence[str]) -> list[str]:
+    """Observers first, which load little, then in the order of the frames: each starts while its
+    readers are loaded."""
+    return sorted(services, key=lambda name: not BY_NAME[name].observer)
+
+
 def with_depth(source: "SourceSpec", fleet: Sequence[str], config: "Config") -> "SourceSpec":
     """A source with the depth maps that a service of the fleet reads."""
     reads = config.surfels.depth_from == "sensor" and any(

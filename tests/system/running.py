@@ -87,7 +87,7 @@ def in_this_process(
         redirect_stderr(errors),
         pytest.raises(SystemExit) as ended,
     ):
-        cli.run_and_exit(cli.app)
+        cli.run_and_exit()
     code = ended.value.code
     assert isinstance(code, int)
     return subprocess.CompletedProcess(words, code, output.getvalue(), errors.getvalue())

@@ -3,7 +3,6 @@
 import inspect
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -19,7 +18,7 @@ from pliant.datasets.rectifier import decode
 from pliant.errors import CalibrationError, ConfigError, DatasetError, RecordingError, ResultError
 from pliant.formats.ply import read_ply
 from pliant.formats.tum import read_tum
-from pliant_services.cli import app
+from pliant_services.cli.commands import app
 
 TINY = "built-in:tiny"
 
@@ -109,7 +108,6 @@ def test_following_a_source_gives_the_numbers_of_the_processes(
 
 def test_a_run_takes_what_the_command_takes() -> None:
     """But for what is for a terminal, and for runs that are resumed or read their settings."""
-    import_module("pliant_services.cli.commands")  # registers them
     command = typer.main.get_command(app).commands["run"]  # type: ignore[attr-defined]
     left = {"view", "save", "poses", "config", "set", "on_crash", "resume", "port"}
     options = {option.opts[0].removeprefix("--").replace("-", "_") for option in command.params}

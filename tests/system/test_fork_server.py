@@ -24,9 +24,9 @@ pytestmark = pytest.mark.system
 SERVER = "fork_server"
 
 
-def has_compiler(pid: int) -> bool:
-    """Whether a process has the compiler's library, which neither ingest nor recorder load."""
-    return "llvmlite" in Path(f"/proc/{pid}/maps").read_text()
+def is_fork(pid: int) -> bool:
+    """Whether a process shows its command line in the server's room, longer than any of its own."""
+    return len(Path(f"/proc/{pid}/cmdline").read_bytes()) > 4096
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_services_are_forks_of_a_server_that_leaves(tmp_path: Path) -> None:
     with running(TINY, "--output", tmp_path / "run", "--mode", "live", *NO_MESH) as run:
         run.wait_for(UP)
         assert set(run.services) == set(SERVICES)
-        assert all(map(has_compiler, run.services.values()))
+        assert all(map(is_fork, run.services.values()))
         assert all(os.getsid(pid) == pid for pid in run.services.values())
         assert not children(run.process.pid, SERVER)
 
@@ -65,18 +65,18 @@ def test_a_server_that_is_killed_changes_nothing(tmp_path: Path) -> None:
     fleet = Fleet(SERVICES, log_folder=output / "logs", on_status=lambda _: None)
 
     def arguments(name: str) -> list[str]:
-        if name == "bundle_adjustment":  # the recorder has been started
+        if name == "bundle_adjustment":  # those before it have been started
             (server,) = children(os.getpid(), SERVER)
             os.kill(server, signal.SIGKILL)
         return service_arguments(name, REQUEST, output)
 
     try:
         fleet.start(arguments)
-        forked = {name: has_compiler(fleet.pids[name]) for name in ("recorder", "ingest")}
+        forked = {name for name, pid in fleet.pids.items() if is_fork(pid)}
         fleet.wait()
     finally:
         fleet.close()
-    assert forked == {"recorder": True, "ingest": False}
+    assert forked == set(SERVICES) - {"bundle_adjustment"}
     write_results(output)
     assert digests(output) == run(tmp_path / "whole")
 

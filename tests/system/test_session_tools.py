@@ -200,9 +200,9 @@ def test_one_more_interruption_changes_neither_the_words_nor_the_code(
         "def say_interrupted(*words): once_more(); return say(*words)\n"
     )
     if moment == "told":
-        code += "cli.app, cli._say = app, say_interrupted\n"
+        code += "commands.app, cli._say = app, say_interrupted\n"
     else:
-        code += "cli.app = lambda **options: 0; atexit.register(once_more)\n"
+        code += "commands.app = lambda **options: 0; atexit.register(once_more)\n"
     code += "cli.main()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     expected = (130, "pliant: interrupted\n") if moment == "told" else (0, "")
@@ -224,7 +224,7 @@ def test_an_interruption_in_a_destructor_is_not_lost(kind: str, raised: str, exp
         f"    signal.signal(signal.{kind}, {raised})\n"
         "    Closed()\n"
         "    threading.Event().wait()\n"
-        "cli.app = app\n"
+        "commands.app = app\n"
         "cli.main()"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
@@ -235,7 +235,7 @@ def test_what_a_signal_ends_without_a_word_does_not_wait_either() -> None:
     code = (
         "import sys, threading; from pliant_services import cli\n"
         "from pliant_services.cli import commands\n"
-        "cli.app = lambda **options: sys.exit(143)\n"
+        "commands.app = lambda **options: sys.exit(143)\n"
         "threading.Thread(target=threading.Event().wait).start(); cli.main()"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60)

@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import sys
 from html.parser import HTMLParser
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +15,12 @@ import typer
 import pliant
 from pliant.config import describe
 from pliant.messages.topics import TOPICS
-from pliant_services.cli import app
+from pliant_services.cli.commands import app
 
 pytestmark = pytest.mark.system
 
 ROOT = Path(__file__).parents[2]
 
-import_module("pliant_services.cli.commands")  # registers them
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
 

@@ -1,6 +1,5 @@
 """A camera from rendered boards: what it was filmed with is found, or a line says why not."""
 
-import importlib
 import re
 from dataclasses import replace
 from functools import cache
@@ -25,9 +24,7 @@ from pliant.datasets.calibration_files import read_calibration
 from pliant.errors import CalibrationError, PliantError
 from pliant_services.calibrate.board import DEFAULT_BOARD, parse_board
 from pliant_services.calibrate.command import calibrate_with_board
-from pliant_services.cli import app
-
-importlib.import_module("pliant_services.cli.commands")  # registers them
+from pliant_services.cli.commands import app
 
 CHESSBOARD = Board(kind="chessboard", columns=9, rows=6)
 CHARUCO = Board(kind="charuco", columns=7, rows=10)

@@ -1,6 +1,5 @@
 """What the command line says of itself, and of the installation."""
 
-import importlib
 import sys
 from types import SimpleNamespace
 from typing import Any
@@ -10,10 +9,10 @@ import typer
 from typer.testing import CliRunner
 
 import pliant
-from pliant_services.cli import app, doctor
+from pliant_services.cli import doctor
+from pliant_services.cli.commands import app
 from pliant_services.cli.groups import DEVELOPMENT, EVERYDAY, LOOK, MACHINES
 
-importlib.import_module("pliant_services.cli.commands")  # registers them
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
 

@@ -14,8 +14,7 @@ import pytest
 import typer
 from benchmarks.__main__ import app as bench
 
-import pliant_services.cli.commands  # noqa: F401  registers them
-from pliant_services.cli import app
+from pliant_services.cli.commands import app
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])

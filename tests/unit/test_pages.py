@@ -3,7 +3,6 @@
 import re
 import shlex
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,12 @@ from benchmarks.__main__ import app as bench
 
 from pliant.algorithms.slam.atlas.known_places import Comparisons
 from pliant.export.export import EXPORTS
-from pliant_services.cli import app
+from pliant_services.cli.commands import app
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 CODE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 
-import_module("pliant_services.cli.commands")  # registers them
 PROGRAMS: dict[str, Any] = {
     "pliant": typer.main.get_command(app),
     "scripts/bench": typer.main.get_command(bench),

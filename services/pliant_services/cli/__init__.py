@@ -8,53 +8,17 @@ import signal
 import sys
 import threading
 import traceback
-from contextlib import suppress
-from typing import Annotated, Any, cast
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
+from typing import TYPE_CHECKING
 
-import typer
-
-from pliant import __version__
 from pliant.errors import PliantError, SourceLostError
 from pliant.exit_codes import DONE, FAILED, INCOMPLETE, INTERRUPTED, USAGE
 from pliant.wording import shortened
-from pliant_services.cli.groups import GroupedCommands
 from pliant_services.runtime.interruptions import deliver_swallowed_interruptions
 
-app = typer.Typer(
-    name="pliant",
-    cls=GroupedCommands,
-    no_args_is_help=True,
-    add_completion=False,
-    context_settings={"max_content_width": 100},
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # it would take [the defaults] in help texts for markup
-    help="Trajectory, dense map and deforming surfaces from the video of one camera.\n\n"
-    "  pliant run clip.mp4\n\n"
-    "  pliant export results/clip.mp4 --to glb\n\n"
-    "  pliant run built-in:room --output results/room\n\n"
-    "  pliant eval results/room --groundtruth built-in:room\n\n"
-    "Exit codes: 0 done, 1 error or failed check, 2 wrong usage, 3 finished without a map or with "
-    "frames broken or missing, 130 interrupted.",
-)
-
-
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"pliant {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def options(
-    version: Annotated[
-        bool,
-        typer.Option(
-            "--version", is_eager=True, callback=_print_version, help="Show the version and exit."
-        ),
-    ] = False,
-) -> None:
-    """Handle the options before a command."""
-
+if TYPE_CHECKING:
+    import typer
 
 _INTERRUPTIONS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _LACKING = {
@@ -63,13 +27,17 @@ _LACKING = {
     errno.ENOMEM: "not enough memory: close other programs, or raise ulimit -v",
 }
 """Advice by the error of the system."""
-# Typer carries its own copy of click, or uses click itself, depending on its version.
-_UsageError: type[typer.BadParameter] = next(
-    cast(Any, c) for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException"
-)
 
 
-def main(application: typer.Typer | None = None) -> None:
+class UsageError(Exception):
+    """A command line that cannot be understood; no text where all has been said."""
+
+    def __init__(self, text: str, code: int = USAGE) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+def main(application: "typer.Typer | None" = None) -> None:
     """Run the command ``pliant``, or another with the same exit codes."""
     _open_standard_streams()
     # A container stops by SIGTERM and a terminal that closes sends SIGHUP: both are a Ctrl-C.
@@ -80,7 +48,7 @@ def main(application: typer.Typer | None = None) -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="surrogateescape")  # names of files are bytes
     try:
-        run_and_exit(application or app)
+        run_and_exit(application)
     except KeyboardInterrupt:  # one more, just before it was ignored
         os._exit(INTERRUPTED)
     except BaseException as error:
@@ -120,7 +88,7 @@ def _leave_at_once(error: BaseException) -> None:
     os._exit(code)
 
 
-def run_and_exit(application: typer.Typer) -> None:
+def run_and_exit(application: "typer.Typer | None" = None) -> None:
     """Run the command line.  Known errors are one line on stderr and an exit code."""
     code = _run(application)
     try:
@@ -136,24 +104,20 @@ def run_and_exit(application: typer.Typer) -> None:
     sys.exit(code)
 
 
-def _run(application: typer.Typer) -> int:
+def _run(application: "typer.Typer | None") -> int:
     try:
         os.getcwd()
     except OSError as error:
         return _say(f"the current folder is not accessible ({error.strerror}): cd to another one")
     try:
-        importlib.import_module("pliant_services.cli.commands")  # registers them
-        code = application(standalone_mode=False)
+        with nullcontext() if application else _server_ahead(sys.argv[1:]):
+            commands = importlib.import_module("pliant_services.cli.commands")
+            code = commands.run_command(application or commands.app)
     except PliantError as error:
         return _say(str(error), INCOMPLETE if isinstance(error, SourceLostError) else FAILED)
-    except _UsageError as error:
-        if type(error).__name__ == "NoArgsIsHelpError":
-            error.show()
-            return USAGE
-        command = getattr(getattr(error, "ctx", None), "command_path", "pliant")
-        text = error.format_message().replace("Value error, ", "").rstrip(".")
-        return _say(f"{text} (see {command} --help)", error.exit_code)
-    except (KeyboardInterrupt, typer.Abort):  # not all versions of Typer hand it on
+    except UsageError as error:
+        return _say(str(error), error.code) if str(error) else error.code
+    except KeyboardInterrupt:
         _take_no_more()
         code = INTERRUPTED
     except SystemExit as end:  # of a signal
@@ -174,6 +138,19 @@ def _run(application: typer.Typer) -> int:
     if code == INTERRUPTED:
         return _say("interrupted", INTERRUPTED)
     return code if isinstance(code, int) else 0
+
+
+def _server_ahead(arguments: Sequence[str]) -> AbstractContextManager[None]:
+    """The fork server of a run, which imports while this process reads the command line.
+
+    It imports what the other profile needs when it is to be forked.
+    """
+    if arguments[:1] != ["run"] or len(arguments) < 2 or "--help" in arguments:
+        return nullcontext()
+    from pliant_services.profiles import PROFILES
+    from pliant_services.runtime.fork_server import started_ahead
+
+    return started_ahead(PROFILES["deformable" if "deformable" in arguments else "rigid"])
 
 
 def _take_no_more() -> None:

@@ -38,14 +38,13 @@ def batch(
     """
     from pliant.results.folder import folder_name
     from pliant_services.batch import command
-    from pliant_services.cli import app
 
     if dask is not None and jobs is not None:
         raise typer.BadParameter(
             "--jobs is for one machine: with --dask, set the threads of the workers"
         )
     command.check_folder(folder)
-    runs = typer.main.get_command(app).commands["run"]  # type: ignore[attr-defined]
+    runs = context.find_root().command.commands["run"]  # type: ignore[attr-defined]
     command.check_options(runs, context.args)
     where = output or Path("results") / folder_name(str(folder))
     raise typer.Exit(

@@ -202,7 +202,7 @@ def run(
     pliant run path/to/tissue --profile deformable --camera moving --depth map
     """
     from pliant_services.profiles import PROFILES
-    from pliant_services.runtime.fork_server import ForkServer
+    from pliant_services.runtime.fork_server import server_for
 
     sets = [_LIGHT] if light else []
     sets += [*(overrides or []), *([f"ingest.mode={mode}"] if mode else [])]
@@ -233,7 +233,7 @@ def run(
     sets += [] if images else ["recorder.images=false"]
     if quiet and (poses or view):
         raise typer.BadParameter("--quiet prints nothing: leave out --quiet, or --poses and --view")
-    with silence() if quiet else nullcontext(), ForkServer(PROFILES[profile]) as server:
+    with silence() if quiet else nullcontext(), server_for(PROFILES[profile]) as server:
         from pliant.datasets.source_spec import SourceSpec  # the server imports at the same time
         from pliant_services.run.command import RunRequest, run_pipeline
 

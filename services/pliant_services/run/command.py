@@ -240,13 +240,14 @@ def _go_through(
                 map_file = MapFile(request.known).path.resolve()
                 write_whole(output / STATE_FOLDER / KNOWN_MAP, str(map_file))
         try:
-            with announced(output, fleet.endpoint, fleet.session), progress:
+            with announced(output, fleet.endpoint, fleet.session):
                 if viewer is not None:
                     viewer.start(fleet)
                 with _printed_poses(request, fleet):
                     fleet.start(lambda name: service_arguments(name, request, output))
                     look_on = f"; watch live: pliant view {output}" if has_viewer() else ""
-                    interrupted = _wait(fleet, progress, f"services are up{look_on}")
+                    with progress:
+                        interrupted = _wait(fleet, progress, f"services are up{look_on}")
                 if viewer is not None:
                     viewer.see_the_end(fleet)
                 return interrupted, None

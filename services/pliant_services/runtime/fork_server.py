@@ -3,6 +3,9 @@
 A service that starts as a program imports hundreds of modules and loads compiled kernels, as the
 others do: four seconds of CPU for a run.  A fork has them already, and shares their memory.
 
+It imports modules until the first request, and what else a service needs when it is requested: so
+the first ones start while the server loads the rest.
+
 The server leaves as soon as all services are started.  They become children of the launcher then,
 which has made itself their reaper (``PR_SET_CHILD_SUBREAPER``).  So it gets their exit codes and
 signals as those of programs that it starts.  Where the server dies, or the system has no such call,
@@ -17,17 +20,19 @@ import gc
 import importlib
 import json
 import os
+import select
 import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Generator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
+from pliant.errors import PliantError
 from pliant.programs import PYTHON
 
 _MODULE = "pliant_services.runtime.fork_server"
@@ -101,7 +106,7 @@ class ForkServer:
             )
 
     def load(self, services: Sequence[str]) -> None:
-        """Load the compiled kernels of these services; returns at once."""
+        """Load the modules and compiled kernels of these services; returns at once."""
         if self._process is not None:
             try:
                 self._link.send(json.dumps({"load": list(services)}).encode())
@@ -150,6 +155,26 @@ class ForkServer:
         self.close()
 
 
+_ahead: list[ForkServer] = []
+
+
+@contextmanager
+def started_ahead(services: Sequence[str]) -> Generator[None]:
+    """Have a server before it is known with which options services start: reading these takes as
+    long as a third of its imports."""
+    with ForkServer(services) as server:
+        _ahead.append(server)
+        try:
+            yield
+        finally:
+            _ahead.clear()
+
+
+def server_for(services: Sequence[str]) -> ForkServer:
+    """The server that was started ahead, or a new one."""
+    return _ahead.pop() if _ahead else ForkServer(services)
+
+
 def _reap_orphans(wanted: bool) -> bool:
     """Whether descendants whose parent ends become our children from now on, as wanted."""
     if sys.platform != "linux":
@@ -158,7 +183,7 @@ def _reap_orphans(wanted: bool) -> bool:
 
 
 def _serve(services: Sequence[str]) -> None:
-    """Import; then load kernels and fork as requested, until the launcher has closed its end.
+    """Import; load kernels and fork when requested, until the launcher has closed its end.
 
     Returns in each fork, with its command line in ``sys.argv``.
     """
@@ -167,11 +192,15 @@ def _serve(services: Sequence[str]) -> None:
     link = socket.socket(fileno=os.dup(0))
     host = importlib.import_module("pliant_services.runtime.host")
     processes = importlib.import_module("pliant_services.processes")
-    for module in ("cli.commands", "runtime.session_end"):
-        importlib.import_module(f"pliant_services.{module}")
-    for name in services:
-        importlib.import_module(processes.BY_NAME[name].module)
+    commands = importlib.import_module("pliant_services.cli.commands")
+    with suppress(PliantError):  # none has this name: what forks need to read theirs is imported
+        commands.app(["service", "", "--connect", ""], standalone_mode=False)
+    modules = [processes.BY_NAME[name].module for name in processes.in_order_of_start(services)]
     while True:
+        if modules and not select.select([link], [], [], 0.0)[0]:
+            importlib.import_module(modules.pop(0))
+            continue
+        modules.clear()
         data, files, _, _ = socket.recv_fds(link, _LONGEST, 2)
         if not data:
             os._exit(0)

@@ -139,10 +139,12 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
 
 @cache
 def load_kernels(name: str) -> None:
-    """Load the compiled kernels of a service, or compile them; a fork of this process has them."""
+    """Load the module of a service and its compiled kernels, or compile them; a fork of this
+    process has them."""
     process = processes.BY_NAME[name]
+    module = importlib.import_module(process.module)
     if process.kernels:
-        importlib.import_module(process.module).warm_up()
+        module.warm_up()
 
 
 def _keep_freed_memory() -> None:

@@ -25,7 +25,7 @@ from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import Status
 from pliant.programs import PYTHON
-from pliant_services.processes import BY_NAME
+from pliant_services.processes import BY_NAME, in_order_of_start
 from pliant_services.runtime.child import Child, first_to_fail
 from pliant_services.runtime.fork_server import ForkServer
 from pliant_services.runtime.relay import Relay
@@ -104,15 +104,15 @@ class Fleet:
         ]
 
     def start(self, arguments: Callable[[str], Sequence[str]]) -> None:
-        """Start every service, readers first, and wait until all have announced themselves.
+        """Start every service, and wait until all have announced themselves.
 
         ``arguments`` gives the further command line of each.  Raises ServiceDiedError, BusError.
         """
         self._arguments = arguments
         for name in self._services:
             (self._log_folder / f"{name}.log").unlink(missing_ok=True)
-        self._server.load(self._services)
-        for name in reversed(self._services):
+        for name in in_order_of_start(self._services):
+            self._server.load([name])
             self._children.append(self._spawn(name))  # one by one: a Ctrl-C leaves none behind
         self._server.close()
         deadline = time.monotonic() + READY_TIMEOUT_S
