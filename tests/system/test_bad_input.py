@@ -290,20 +290,22 @@ def fleet(tmp_path: Path) -> Generator[Fleet]:
 
 def test_a_service_that_dies_during_the_start_is_named(fleet: Fleet, tmp_path: Path) -> None:
     def arguments(name: str) -> list[str]:
-        if name == "tracking":  # the recorder and bundle adjustment have been started
-            os.kill(fleet.pids["bundle_adjustment"], signal.SIGKILL)
+        if name == "bundle_adjustment":  # the last one: tracking has been started
+            os.kill(fleet.pids["tracking"], signal.SIGKILL)
         if name == "ingest":
             return ["--source", TINY]
         return ["--output", str(tmp_path / "recording.mcap")] if name == "recorder" else []
 
-    with pytest.raises(ServiceDiedError, match="bundle_adjustment was killed by SIGKILL"):
+    with pytest.raises(ServiceDiedError, match="tracking was killed by SIGKILL"):
         fleet.start(arguments)
 
 
 def test_ctrl_c_during_the_start_leaves_no_process(fleet: Fleet, tmp_path: Path) -> None:
     def arguments(name: str) -> list[str]:
-        if name == "ingest":
+        if name == "bundle_adjustment":  # the last one
             raise KeyboardInterrupt
+        if name == "ingest":
+            return ["--source", TINY]
         return ["--output", str(tmp_path / "recording.mcap")] if name == "recorder" else []
 
     with pytest.raises(KeyboardInterrupt):
