@@ -10,6 +10,7 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 
 from pliant.algorithms.geometry import align_umeyama, inverse
 from pliant.algorithms.slam.adjust import final_adjustment, second_start, track_sample
+from pliant.algorithms.slam.adjust.sampled_frames import sampled_frames
 from pliant.algorithms.slam.adjust.second_start import (
     SampledFrames,
     Sightings,
@@ -93,7 +94,7 @@ def fed(mapper, tracks, first=0):
     return deltas
 
 
-def sampled_frames(mapper):
+def kept_frames(mapper):
     return len(mapper._sample.frames)
 
 
@@ -107,14 +108,14 @@ def test_a_mapper_keeps_the_sample_only_while_the_camera_turns_in_place(turn):
     mapper = Mapper(CAMERA, PARAMETERS, 0)
     fed(mapper, turn[1])
     assert mapper.atlas.active is not None
-    assert sampled_frames(mapper) == 90
+    assert kept_frames(mapper) == 90
     window = PARAMETERS.window.model_copy(update={"keyframes": 6})  # a slide is judged beyond it
     slides = Mapper(CAMERA, PARAMETERS.model_copy(update={"window": window}), 0)
     frames = list(Scene.box(death=0.02).frames(sideways(60, step=0.1)))
     fed(slides, frames[:10])
-    assert sampled_frames(slides) == 10
+    assert kept_frames(slides) == 10
     fed(slides, frames, 10)
-    assert sampled_frames(slides) == 0
+    assert kept_frames(slides) == 0
 
 
 def test_a_long_turn_with_many_keyframes_drops_the_sample(turn, monkeypatch):
@@ -122,10 +123,10 @@ def test_a_long_turn_with_many_keyframes_drops_the_sample(turn, monkeypatch):
     fed(mapper, turn[1][:60])
     number = len(mapper.atlas.active.keyframes)
     monkeypatch.setattr(track_sample, "_MOST_KEYFRAMES", number)
-    assert sampled_frames(mapper) == 60
+    assert kept_frames(mapper) == 60
     fed(mapper, turn[1], 60)
     assert len(mapper.atlas.active.keyframes) > number
-    assert sampled_frames(mapper) == 0
+    assert kept_frames(mapper) == 0
 
 
 def of_bytes(delta):
@@ -137,7 +138,7 @@ def test_a_restored_mapper_chooses_the_same_map(turn, monkeypatch):
     mapper = Mapper(CAMERA, PARAMETERS, 0)
     fed(mapper, turn[1][:60])
     restored = load_state(save_state(mapper))
-    assert sampled_frames(restored) == 60
+    assert kept_frames(restored) == 60
     one, other = fed(mapper, turn[1], 60), fed(restored, turn[1], 60)
     for a, b in zip([*one, mapper.finish()], [*other, restored.finish()], strict=True):
         assert of_bytes(a) == of_bytes(b)
@@ -296,7 +297,7 @@ def test_a_camera_that_stands_for_long_adds_few_frames():
     mapper = Mapper(CAMERA, PARAMETERS, 0)
     fed(mapper, list(around(3000, death=0.02).frames(poses)))
     segment = mapper.atlas.active.segment
-    sampled = segment._sampled(mapper._sample)
+    sampled = sampled_frames(mapper._sample, segment.path, segment.keyframes)
     assert len(mapper._sample.frames) == 240
     assert len(sampled.numbers) <= 60 + 2 * 32
     adjacent = np.diff(sampled.numbers) == 1

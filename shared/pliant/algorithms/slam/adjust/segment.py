@@ -35,12 +35,11 @@ from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.slam.adjust.final_adjustment import adjust_keyframes
 from pliant.algorithms.slam.adjust.inertial_adjustment import Coupling, TimedSamples
 from pliant.algorithms.slam.adjust.ordinary_frames import OrdinaryFrames
-from pliant.algorithms.slam.adjust.second_start import SampledFrames, SecondPose
+from pliant.algorithms.slam.adjust.sampled_frames import place_frames, sampled_frames
 from pliant.algorithms.slam.adjust.track_sample import TrackSample
 from pliant.algorithms.slam.calibration.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.slam.calibration.rolling_shutter import FramePoses, RolledFrame
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
-from pliant.algorithms.slam.estimate.pose import Correspondences, refine_pose
 from pliant.algorithms.slam.map.covisibility import focus_of
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.algorithms.slam.map.landmarks import MAPPED, Landmarks
@@ -49,12 +48,6 @@ from pliant.algorithms.slam.parameters import MappingParameters
 from pliant.compiler.kernel import kernel
 
 _MIN_DEPTH = 1e-6
-
-_SAMPLED_PAIRS = 4
-"""Maximum pairs of successive frames on one reference keyframe, in the sample of a second start.  A
-camera that turns slowly, or stands, sees the same tracks in many frames: their system is dense, and
-takes the cube of their number.
-"""
 
 
 @dataclass(kw_only=True)
@@ -350,13 +343,16 @@ class Segment:
         """
         motions = self.path.motions(self.keyframes)
         before = np.array([keyframe.log_focal for keyframe in self.keyframes])
-        sampled = None if sample is None or self.sparsified else self._sampled(sample)
+        sampled = None
+        if sample is not None and not self.sparsified:
+            sampled = sampled_frames(sample, self.path, self.keyframes)
         found, gone, moves, frames = adjust_keyframes(
             self.keyframes, self.points, known, parameters, motions, self._timed(inertial), sampled
         )
         self.points.remove(gone)
         if frames:
-            self._place(frames, found, parameters)
+            placed = place_frames(frames, self.path, self.keyframes, found, parameters)
+            self.ordinary.forget(placed)  # what they observe has the earlier readout
         self.to_global_shutter(self.keyframes, found)
         self.ordinary.seen_by(known.view, found.view)
         if found.changes:
@@ -369,60 +365,6 @@ class Segment:
         moves = self.dropped.together_with(moves)
         self.dropped.move(moves)
         return found, moves
-
-    def _sampled(self, sample: TrackSample) -> SampledFrames | None:
-        """The sample with the poses of its frames; None without one."""
-        if not sample.frames:
-            return None
-        seen_in = {each.frame for each in sample.frames}
-        frames, T_world_camera, _ = self.path.frames_on(self.keyframes)
-        hosted = {keyframe.id: dict[int, F64]() for keyframe in self.keyframes}
-        for each, pose in zip(frames, T_world_camera, strict=True):
-            if each.frame in seen_in:
-                T_host_camera = inverse(each.keyframe.T_world_camera) @ pose
-                hosted[each.keyframe.id][each.frame] = T_host_camera
-        own = np.array([keyframe.frame for keyframe in self.keyframes], np.int64)
-        poses = dict[int, tuple[int, F64]]()
-        for slot, on_one in enumerate(hosted.values()):
-            every = -(-len(on_one) // _SAMPLED_PAIRS)
-            for n, (frame, T_host_camera) in enumerate(on_one.items()):
-                if n % every < 2:
-                    poses[frame] = slot, T_host_camera
-        poses |= {frame: (slot, np.eye(4)) for slot, frame in enumerate(own.tolist())}
-        numbers = np.array(sorted(poses), np.int64)
-        placed = [poses[number] for number in numbers.tolist()]
-        return SampledFrames(
-            numbers=numbers,
-            hosts=np.array([slot for slot, _ in placed], np.int64),
-            T_host_camera=np.array([pose for _, pose in placed]),
-            keyframes=np.searchsorted(numbers, own),
-            sampled=sample.frames,
-        )
-
-    def _place(
-        self, frames: list[SecondPose], known: SelfCalibration, parameters: MappingParameters
-    ) -> None:
-        """Place frames that are no keyframes as a second start has them.
-
-        Their observations of landmarks are those with the earlier readout, and are forgotten.
-        """
-        placed, done = {each.frame: each for each in frames}, set[int]()
-        limits, camera = parameters.localisation, known.view.camera
-        for frame, keyframe, _ in self.path.frames_on(self.keyframes)[0]:
-            each = placed.get(frame)
-            if each is None:
-                continue
-            seen = Correspondences(each.xyz, each.points_px, known.weights(each.points_px))
-            found = refine_pose(
-                each.T_world_camera, seen, camera, parameters.bundle,
-                inlier_px=limits.inlier_px, iterations=1,
-            )  # fmt: skip
-            inliers = int(np.count_nonzero(found.inliers))
-            if inliers >= limits.min_inliers:
-                pose = found.T_world_camera, inliers, found.information
-                self.path.refine(frame, keyframe, *pose)
-                done.add(frame)
-        self.ordinary.forget(done)
 
 
 @kernel
