@@ -20,7 +20,7 @@ from pliant.export.kinds import OF_STILL_SCENES
 from pliant.messages import codec, topics
 from pliant.recording.writer import RecordingWriter
 from pliant.results.folder import RECORDING_NAME, run_metadata
-from pliant.results.surfels import recorded_surfels
+from pliant.results.surfel_frames import recorded_surfels
 from pliant.results.write import write_results
 from pliant_services.nodes import ingest, surfels
 from pliant_services.runtime.monitor import SilentMonitor
