@@ -42,14 +42,13 @@ class FollowedMap:
         before = min(int(share), len(self._stamps_ns) - 1)
         after, share = min(before + 1, len(self._stamps_ns) - 1), share - before
         between = (1.0 - share) * found.displacements[before] + share * found.displacements[after]
-        T = found.T_world_camera[before if share < 0.5 else after].copy()
+        nearest = found.T_world_camera[before if share < 0.5 else after]
         here.displacements = between[None] / found.depth
-        here.T_world_camera = T.copy()
+        here.T_world_camera = nearest.copy()
         here.T_world_camera[:3, 3] /= found.depth
-        if stamp_ns not in self._stamps_ns:
-            followed = here.follow(ids, points_px, camera)
-            if followed is None:
-                return None
-            T = followed
+        is_keyframe = stamp_ns in self._stamps_ns
+        T_world_camera = nearest if is_keyframe else here.follow(ids, points_px, camera)
+        if T_world_camera is None:
+            return None
         landmarks, pixels = here.landmarks(ids, points_px)
-        return SeenMap(T_world_camera=T, landmarks=landmarks, points_px=pixels)
+        return SeenMap(T_world_camera=T_world_camera, landmarks=landmarks, points_px=pixels)

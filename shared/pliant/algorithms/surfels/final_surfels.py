@@ -2,13 +2,16 @@
 
 While it runs, surfels have their camera from the equilibrium or from the last seconds, and their
 depth from their birth.  The final map knows both better.  So each frame has its camera by the map,
-and each surfel the depth of the landmarks around it.  A surfel keeps its pixel.
+and each surfel a depth by the landmarks around it.  A surfel keeps its pixel.
 
-World and unit stay those in which the surfels of a segment started: its first frame has the camera
-and the median depth that it had.
+**Depth.**  With f(t) the depth of the landmarks around a surfel by its own, there are two estimates
+of its depth z(t).  The landmarks' is f(t) z(t), and its own, without the error of its birth, is
+z(t) median(f).  The first errs where camera and deformation are confused, the second as the surfel
+drifts.  Their geometric mean is the result.  f is measured some times a second, and is linear
+between.
 
-The depth of a surfel is multiplied by a factor that is measured some times a second, and changes
-linearly between: from frame to frame a surfel knows best how it moves.
+**World and unit** stay those in which the surfels of a segment start: its first frame has the
+camera that it had, and the landmarks there have the depths that the surfels had.
 """
 
 from dataclasses import dataclass, field, replace
@@ -37,8 +40,8 @@ class FinalSurfels:
     """What the final map says about the surfels of a recording.
 
     frames, stamps_ns, T_world_camera: of F frames, in the world of the surfels.
-    segments, ids, factor_stamps_ns, factors: of surfels at some times, by which their depths are to
-    be multiplied; ordered by segment, id and time.
+    segments, ids, factor_stamps_ns, factors: R factors by which the depths of surfels are to be
+    multiplied at some times; ordered by segment, id and time.
     """
 
     frames: Annotated[I64, Shape("F")]
@@ -115,13 +118,13 @@ class SurfelsByMap:
     def take(self, surfels: SurfelFrame, stamp_ns: int, seen: SeenMap | None) -> None:
         """A frame whose surfels have a camera, and the final map in it."""
         segment = self._segments.setdefault(surfels.segment, _Segment())
-        T = None
-        if seen is not None and not surfels.lost:
-            T = self._place(segment, surfels, stamp_ns, seen)
+        places = seen is not None and not surfels.lost
+        unseen = seen is None or surfels.lost
+        final = None if unseen else self._place(segment, surfels, stamp_ns, seen)
+        segment.final.append(final)
         segment.frames.append(surfels.frame)
         segment.stamps_ns.append(stamp_ns)
         segment.online.append(surfels.T_world_camera.copy())
-        segment.final.append(T)
 
     def _place(
         self, segment: _Segment, surfels: SurfelFrame, stamp_ns: int, seen: SeenMap
@@ -164,8 +167,15 @@ class SurfelsByMap:
             segments=columns[0][order],
             ids=columns[1][order],
             factor_stamps_ns=columns[2][order],
-            factors=factors[order],
+            factors=_with_medians(columns[0][order], columns[1][order], factors[order]),
         )
+
+
+def _with_medians(segments: I64, ids: I64, factors: F32) -> F32:
+    """(R,) geometric mean of each factor and the median of its surfel's."""
+    changes = (np.diff(segments) != 0) | (np.diff(ids) != 0)
+    of_surfels = np.split(factors, np.flatnonzero(changes) + 1)
+    return np.concatenate([np.sqrt(each * np.median(each)) for each in of_surfels if len(each)])
 
 
 def _filled(segment: _Segment) -> F64:
