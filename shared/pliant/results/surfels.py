@@ -161,6 +161,11 @@ def surfel_summary(report: dict[str, Any]) -> list[str]:
         )
     if report.get("deforming_map"):
         lines.append(f"no {DEFORMING_MAP_NAME}: {report['deforming_map']}")
+    elif "deforming_map" in report:
+        lines.append(
+            "Cameras and surfels are those of the map of the whole run, which deforms "
+            f"({ONLINE_NAME}: as they were online)"
+        )
     return lines
 
 

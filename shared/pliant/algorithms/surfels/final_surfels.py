@@ -118,7 +118,6 @@ class SurfelsByMap:
     def take(self, surfels: SurfelFrame, stamp_ns: int, seen: SeenMap | None) -> None:
         """A frame whose surfels have a camera, and the final map in it."""
         segment = self._segments.setdefault(surfels.segment, _Segment())
-        places = seen is not None and not surfels.lost
         unseen = seen is None or surfels.lost
         final = None if unseen else self._place(segment, surfels, stamp_ns, seen)
         segment.final.append(final)
@@ -146,36 +145,35 @@ class SurfelsByMap:
 
     def found(self) -> FinalSurfels:
         """Of all frames of the segments that see the map."""
-        frames, poses = list[I64](), list[F64]()
-        for segment in self._segments.values():
-            if segment.unit:
-                frames.append(np.array(segment.frames, np.int64))
-                poses.append(_filled(segment))
+        placed = [segment for segment in self._segments.values() if segment.unit]
+        none = np.zeros(0, np.int64)
+        frames = np.concatenate([none, *(np.array(each.frames, np.int64) for each in placed)])
+        T = np.concatenate([np.zeros((0, 4, 4)), *(_filled(each) for each in placed)])
         counts = [len(ids) for _, ids, _, _ in self._factors]
-        columns = (
-            np.repeat(np.array([each for each, _, _, _ in self._factors], np.int64), counts),
-            np.concatenate([np.zeros(0, np.int64), *(ids for _, ids, _, _ in self._factors)]),
-            np.repeat(np.array([at for _, _, at, _ in self._factors], np.int64), counts),
-        )
+        segments = np.repeat(np.array([n for n, _, _, _ in self._factors], np.int64), counts)
+        ids = np.concatenate([none, *(ids for _, ids, _, _ in self._factors)])
+        stamps_ns = np.repeat(np.array([at for _, _, at, _ in self._factors], np.int64), counts)
         factors = np.concatenate([np.zeros(0, np.float32), *(f for _, _, _, f in self._factors)])
-        order = np.lexsort(columns[::-1])
-        every = np.concatenate([np.zeros(0, np.int64), *frames])
-        in_order = np.argsort(every, kind="stable")
+        by_frame, order = np.argsort(frames, kind="stable"), np.lexsort((stamps_ns, ids, segments))
+        segments, ids = segments[order], ids[order]
         return FinalSurfels(
-            frames=every[in_order],
-            T_world_camera=np.concatenate([np.zeros((0, 4, 4)), *poses])[in_order],
-            segments=columns[0][order],
-            ids=columns[1][order],
-            factor_stamps_ns=columns[2][order],
-            factors=_with_medians(columns[0][order], columns[1][order], factors[order]),
+            frames=frames[by_frame],
+            T_world_camera=T[by_frame],
+            segments=segments,
+            ids=ids,
+            factor_stamps_ns=stamps_ns[order],
+            factors=_with_medians(segments, ids, factors[order]),
         )
 
 
 def _with_medians(segments: I64, ids: I64, factors: F32) -> F32:
     """(R,) geometric mean of each factor and the median of its surfel's."""
     changes = (np.diff(segments) != 0) | (np.diff(ids) != 0)
-    of_surfels = np.split(factors, np.flatnonzero(changes) + 1)
-    return np.concatenate([np.sqrt(each * np.median(each)) for each in of_surfels if len(each)])
+    out = factors.copy()
+    for of_surfel in np.split(out, np.flatnonzero(changes) + 1):
+        if len(of_surfel):
+            of_surfel[:] = np.sqrt(of_surfel * np.median(of_surfel))
+    return out
 
 
 def _filled(segment: _Segment) -> F64:
