@@ -282,8 +282,20 @@ def test_all_readers_have_the_surfels_of_the_final_map(tmp_path: Path) -> None:
         known = np.isfinite(found["positions"][1, :, 0])
         tracked = final[1].state == 0
         np.testing.assert_array_equal(found["positions"][1, known], final[1].positions[tracked])
-    for kind in ("surface", "animation"):
-        assert export_result(tmp_path, kind, tmp_path / f"{kind}.glb").exists()
+    places = {"final": tmp_path, "online": tmp_path / "alone"}
+    places["online"].mkdir()
+    (places["online"] / RECORDING_NAME).hardlink_to(recording)
+    surfaces = [export_result(at, "surface", tmp_path / name) for name, at in places.items()]
+    same = [
+        (surfaces[0] / name).read_bytes() == (surfaces[1] / name).read_bytes()
+        for name in (f"{frame:06d}.ply" for frame in range(FRAMES))
+    ]
+    assert same == [False] * (FRAMES - 1) + [True]
+    animated = [
+        export_result(at, "animation", tmp_path / f"{name}.glb").read_bytes()
+        for name, at in places.items()
+    ]
+    assert animated[0] != animated[1]
 
 
 def test_files_have_the_final_surfels_and_the_online_trajectory(
