@@ -1,7 +1,7 @@
 """The camera of every frame by the final map, and where its landmarks are then.
 
 Between two keyframes the displacements are nearly those in between.  From there camera and
-displacements of the frame are found as ``frame_camera.py`` does while a run goes on.
+displacements of the frame are found as ``frame_camera.py`` does online.
 """
 
 from dataclasses import dataclass
