@@ -32,6 +32,9 @@ _FLAT = 0.05
 _SAME = 0.02
 """Share of the depth within which they lie on a plane: otherwise an edge may be between them."""
 
+_FEWEST = 30
+"""Surfels that determine the unit."""
+
 _Surfels = TypeVar("_Surfels", bound=SurfelFrame)
 
 
@@ -39,7 +42,7 @@ _Surfels = TypeVar("_Surfels", bound=SurfelFrame)
 class FinalSurfels:
     """What the final map says about the surfels of a recording.
 
-    frames, stamps_ns, T_world_camera: of F frames, in the world of the surfels.
+    frames, T_world_camera: of F frames, in the world of the surfels.
     segments, ids, factor_stamps_ns, factors: R factors by which the depths of surfels are to be
     multiplied at some times; ordered by segment, id and time.
     """
@@ -132,7 +135,7 @@ class SurfelsByMap:
         starts = segment.unit == 0.0
         if starts or stamp_ns - segment.measured_ns >= INTERVAL_NS:
             rows, factors = depth_factors(surfels, seen)
-            if starts and len(rows):
+            if starts and len(rows) >= _FEWEST:
                 segment.unit = 1.0 / float(np.median(factors))
                 T_map_camera = _in_unit(seen.T_world_camera, segment.unit)
                 segment.T_surfels_map = surfels.T_world_camera @ inverse(T_map_camera)
