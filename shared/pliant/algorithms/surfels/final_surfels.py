@@ -121,8 +121,9 @@ class SurfelsByMap:
     def take(self, surfels: SurfelFrame, stamp_ns: int, seen: SeenMap | None) -> None:
         """A frame whose surfels have a camera, and the final map in it."""
         segment = self._segments.setdefault(surfels.segment, _Segment())
-        unseen = seen is None or surfels.lost
-        final = None if unseen else self._place(segment, surfels, stamp_ns, seen)
+        final = None
+        if seen is not None and not surfels.lost:
+            final = self._place(segment, surfels, stamp_ns, seen)
         segment.final.append(final)
         segment.frames.append(surfels.frame)
         segment.stamps_ns.append(stamp_ns)
