@@ -25,6 +25,8 @@ from pliant_services.runtime.launcher import Fleet
 
 _LAST_S = 5.0
 """Maximum wait for the last poses after their service has ended, s."""
+_LATE = 4
+"""Messages that wait for an earlier one, which was lost on its way and is sent again."""
 
 
 @contextmanager
@@ -37,17 +39,22 @@ def printed_poses(fleet: Fleet, known: MapFile | None, *, deformable: bool) -> G
         history.know(keyframe)
 
     def print_all() -> None:
-        following = 0
-        while (item := heard.get()) is not None:
-            if item.is_end:
-                return
-            if item.sequence < following:  # sent again
-                continue
-            following = item.sequence + 1
-            with suppress(MessageError):
-                message = codec.decode(topic.message, item.data, max_bytes=topic.max_bytes)
-                assert isinstance(message, MapUpdate | Surfels)
-                print(_line(message, history), flush=True)
+        following, held = 0, dict[int, Received]()
+        while (item := heard.get()) is not None and not item.is_end:
+            if item.sequence >= following:  # not sent again
+                held[item.sequence] = item
+            while following in held or len(held) > _LATE:
+                item = held.pop(min(held))
+                following = item.sequence + 1
+                print_one(item)
+        for sequence in sorted(held):
+            print_one(held[sequence])
+
+    def print_one(item: Received) -> None:
+        with suppress(MessageError):
+            message = codec.decode(topic.message, item.data, max_bytes=topic.max_bytes)
+            assert isinstance(message, MapUpdate | Surfels)
+            print(_line(message, history), flush=True)
 
     def print_while_somebody_reads() -> None:
         with suppress(OSError):
