@@ -218,6 +218,18 @@ def _between(edges: Edges, known: BoolArray) -> Edges:
     return Edges(edges.ends[rows], edges.first[rows], edges.second[rows], edges.lengths[rows])
 
 
+def share_of_neighbours(edges: Edges, some: BoolArray, of: BoolArray) -> F64:
+    """(N,) share of each surfel's neighbours among ``of`` that are ``some``, (N,) each; 1 without
+    any.
+    """
+    i, j = edges.ends.T
+    counts = [
+        np.bincount(i, rows[j], len(rows)) + np.bincount(j, rows[i], len(rows))
+        for rows in (some & of, of)
+    ]
+    return np.where(counts[1] > 0, counts[0] / np.maximum(counts[1], 1.0), 1.0)
+
+
 @fast_kernel
 def _image_matrix(pose: F64, out: F64) -> None:
     """The four entries of a patch's distortion in the image since its birth, row by row."""

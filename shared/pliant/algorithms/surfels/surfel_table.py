@@ -15,6 +15,7 @@ from pliant.algorithms.surfels.deformation_graph import (
     keep_rows,
     median_strains,
     no_edges,
+    share_of_neighbours,
 )
 from pliant.algorithms.surfels.deformation_models import move_poses
 from pliant.algorithms.surfels.patch_sampling import BIAS, GAIN, POSE_FLOATS, A, B, F, X
@@ -34,6 +35,11 @@ from pliant.algorithms.surfels.validation import (
 _EVEN_STRAIN, _STEEPNESS = 0.15, 1.2
 """Half of the surfels with this median strain are within 1 % of their depth; fitted on the rendered
 scenes of ``scripts/bench surfels``."""
+_ALONE = 0.5
+"""Share of the confidence that stays where a surfel has lost all of its neighbours; with half of
+them it has all."""
+_IN_VIEW = 0.5
+"""Share of a patch inside of the image."""
 _EVEN_DISTORTION, _DISTORTION_STEEPNESS = 0.7, 2.0
 """The same for the distortion, within 3 px in the image; fitted on half of eight videos of tissue,
 tested on the others."""
@@ -210,16 +216,20 @@ def _confidence(table: SurfelTable, *, depth_is_known: bool) -> F64:
     made-up depth a surfel that slides in the image is distorted otherwise than they are.  An error
     that all of them share shows in neither.  Only surfels that are both tracked are compared: the
     others have old positions.  Without such edges the ZNCC with the birth template remains, and
-    half of it where a surfel is not tracked.
+    half of it where a surfel is not tracked.  Few that are left of many neighbours may have been
+    led astray by what took the others.
     """
     if depth_is_known:
         off = median_strains(table.poses, table.edges, table.tracked) / _EVEN_STRAIN
         agreement = 1.0 / (1.0 + off**_STEEPNESS)
+        in_view = table.tracked | (table.validations[:, INSIDE] >= _IN_VIEW)
+        left = share_of_neighbours(table.edges, table.tracked, in_view)
+        trust = np.where(table.tracked, np.minimum(1.0, _ALONE + left), 1.0)
     else:
         off = np.where(table.tracked, table.distortions, np.nan) / _EVEN_DISTORTION
-        agreement = 1.0 / (1.0 + off**_DISTORTION_STEEPNESS)
+        agreement, trust = 1.0 / (1.0 + off**_DISTORTION_STEEPNESS), 1.0
     likeness = np.clip(table.birth_zncc, 0.0, 1.0) * np.where(table.tracked, 1.0, 0.5)
-    return np.where(np.isnan(agreement), likeness, agreement)
+    return trust * np.where(np.isnan(agreement), likeness, agreement)
 
 
 def _f32(values: F64) -> F32:
