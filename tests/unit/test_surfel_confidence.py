@@ -84,6 +84,24 @@ def test_a_surfel_that_has_lost_most_of_its_neighbours_is_doubtful() -> None:
     assert confidence(table)[row] == pytest.approx(table.birth_zncc[row])
 
 
+def test_a_measured_depth_overrules_the_neighbours() -> None:
+    motions = [motion((0.0, 0.0, 0.0), (0.001 * k, 0.0, 0.0)) for k in range(4)]
+    renderer, camera = board_renderer(motions)
+    first, second, third, fourth = film(renderer, 4)
+    tracker = SurfelTracker(SurfelParameters(max_surfels=60, levels=2))
+    tracker.start(first.image, first.depth_m, camera)
+    right = tracker.track(second.image, STEP_S, depth=second.depth_m)
+    assert right.confidence[right.state == SurfelState.TRACKED].min() > 0.5
+    old = right.ids
+    wrong = tracker.track(third.image, STEP_S, depth=1.05 * third.depth_m)
+    tracked = (wrong.state == SurfelState.TRACKED) & np.isin(wrong.ids, old)
+    assert tracked.sum() > 30
+    assert (wrong.confidence[tracked] == 0.0).all()
+    unmeasured = tracker.track(fourth.image, STEP_S)
+    tracked = (unmeasured.state == SurfelState.TRACKED) & np.isin(unmeasured.ids, old)
+    assert np.median(unmeasured.confidence[tracked]) > 0.5
+
+
 def test_on_made_up_depth_a_patch_that_is_distorted_otherwise_is_doubtful() -> None:
     motions = [motion((0.0, 0.0, 0.0), (0.001 * k, 0.0, 0.0)) for k in range(2)]
     renderer, camera = board_renderer(motions)

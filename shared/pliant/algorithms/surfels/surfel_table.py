@@ -59,6 +59,8 @@ class SurfelTable:
     birth: list[Templates] = field(default_factory=_none)  # the same at birth
     renewed: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))  # not that of birth
     birth_zncc: F64 = field(default_factory=lambda: np.zeros(0))  # with the birth template
+    # Whether the depth map of the frame shows another depth.
+    contradicted: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
     # ``patch_distortions`` on made-up depth, else 0.
     distortions: F64 = field(default_factory=lambda: np.zeros(0))
     poses: F64 = field(default_factory=lambda: np.zeros((0, POSE_FLOATS)))  # last good ones
@@ -98,6 +100,7 @@ class SurfelTable:
             setattr(self, name, [join(a, b) for a, b in pairs])
         self.renewed = np.concatenate([self.renewed, np.zeros(n, np.bool_)])
         self.birth_zncc = np.concatenate([self.birth_zncc, np.ones(n)])
+        self.contradicted = np.concatenate([self.contradicted, np.zeros(n, np.bool_)])
         self.distortions = np.concatenate([self.distortions, np.zeros(n)])
         self.poses = np.concatenate([self.poses, poses])
         self.guesses = np.concatenate([self.guesses, poses])
@@ -134,6 +137,7 @@ class SurfelTable:
         for name in (
             "renewed",
             "birth_zncc",
+            "contradicted",
             "distortions",
             "poses",
             "rest",
@@ -217,7 +221,7 @@ def _confidence(table: SurfelTable, *, depth_is_known: bool) -> F64:
     that all of them share shows in neither.  Only surfels that are both tracked are compared: the
     others have old positions.  Without such edges the ZNCC with the birth template remains, and
     half of it where a surfel is not tracked.  Few that are left of many neighbours may have been
-    led astray by what took the others.
+    led astray by what took the others.  A measured depth overrules all of them.
     """
     if depth_is_known:
         off = median_strains(table.poses, table.edges, table.tracked) / _EVEN_STRAIN
@@ -229,7 +233,8 @@ def _confidence(table: SurfelTable, *, depth_is_known: bool) -> F64:
         off = np.where(table.tracked, table.distortions, np.nan) / _EVEN_DISTORTION
         agreement, trust = 1.0 / (1.0 + off**_DISTORTION_STEEPNESS), 1.0
     likeness = np.clip(table.birth_zncc, 0.0, 1.0) * np.where(table.tracked, 1.0, 0.5)
-    return trust * np.where(np.isnan(agreement), likeness, agreement)
+    found = trust * np.where(np.isnan(agreement), likeness, agreement)
+    return np.where(table.contradicted, 0.0, found)
 
 
 def _f32(values: F64) -> F32:
