@@ -100,6 +100,27 @@ def test_surfels_that_are_probably_wrong_are_doubtful(
     assert (CONTRADICTED in summary) == (CONTRADICTED in changed.get("note", ""))
 
 
+@pytest.mark.parametrize(
+    ("refusal", "word"),
+    [
+        ("", "good"),
+        ("a rigid map predicts its tracks as well, or nearly so", "good"),
+        ("too few tracks through several keyframes determine it", "good"),
+        ("only 18% of its landmarks are certain", "doubtful"),
+    ],
+)
+def test_cameras_that_the_whole_clip_does_not_determine_are_doubtful(
+    refusal: str, word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As before a camera that stands still, declared as moving."""
+    record(tmp_path, "sensor")
+    monkeypatch.setattr("pliant.results.surfels._moves_on_own_map", lambda _: True)
+    monkeypatch.setattr("pliant.results.surfels.write_deforming_map", lambda *_: refusal)
+    report = write_results(tmp_path)
+    assert (report["verdict"], report["deforming_map"]) == (word, refusal)
+    assert (word == "good") or refusal in report["verdict_reason"]
+
+
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("deforming")

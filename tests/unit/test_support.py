@@ -183,6 +183,7 @@ def test_a_run_that_did_not_keep_up_is_doubtful() -> None:
         ({"slipping": 30, "unsure": 61}, DOUBTFUL, "in 30% of the frames"),
         ({"contradicted": 8}, GOOD, "all frames"),
         ({"contradicted": 61}, DOUBTFUL, "in 61% of the frames the depth map contradicts most"),
+        ({"map_problem": "only 9% of its"}, DOUBTFUL, "not determined by the whole clip: only 9%"),
         ({"together": 20}, GOOD, "all frames"),
         ({"together": 61}, DOUBTFUL, "if the camera moves, use --camera moving"),
         ({"in_segments": [60, 40]}, DOUBTFUL, "60% of the frames"),

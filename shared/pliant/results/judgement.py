@@ -94,8 +94,8 @@ def slipping_frames(tracked: Sequence[float], in_view: Sequence[int]) -> list[in
 
 def judge_surfels(
     *, frames: int, in_segments: list[int], slipping: int, depth_from: str, unusable: int,
-    unsure: int = 0, together: int = 0, contradicted: int = 0, broken: int = 0,
-    absent: int = 0, behind: int = 0, failed: bool = False,
+    unsure: int = 0, together: int = 0, contradicted: int = 0, map_problem: str = "",
+    broken: int = 0, absent: int = 0, behind: int = 0, failed: bool = False,
 ) -> tuple[str, str]:  # fmt: skip
     """As ``judge``, of a surface that deforms.
 
@@ -103,7 +103,8 @@ def judge_surfels(
     in which few of the surfels in view are.   unsure: those in which few are right, counted by
     their confidences.   unusable: depth maps that no surfel could start on.
     together: frames of a camera configured as static in which all surfels move together.
-    contradicted: frames whose depth map is not that of most surfels.
+    contradicted: frames whose depth map is not that of most surfels.   map_problem: why the tracks
+    of the whole run do not determine camera and depths; "" without evidence of that.
     """
     word, why = judge(
         frames=frames, in_segments=in_segments, doubtful=0, broken=broken,
@@ -136,6 +137,8 @@ def judge_surfels(
             f"in {contradicted / posed:.0%} of the frames the depth map contradicts most surfels: "
             "the surface stretches, or the image does"
         )
+    if map_problem:
+        return DOUBTFUL, f"camera and depths are not determined by the whole clip: {map_problem}"
     if unusable > (1.0 - _WHOLE) * frames:
         return DOUBTFUL, f"{unusable / frames:.0%} of the depth maps could not be used"
     if depth_from == "flat":

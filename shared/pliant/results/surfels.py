@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pliant.algorithms.arrays import F64
+from pliant.algorithms.deformable.judged_map import is_evidence
 from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.config import recorded_config
 from pliant.formats.npz import NpzWriter
@@ -23,7 +24,7 @@ from pliant.messages.types import (
     Surfels,
 )
 from pliant.recording.reader import Recording
-from pliant.results.deforming_map import write_deforming_map
+from pliant.results.deforming_map import NO_MAP, write_deforming_map
 from pliant.results.folder import (
     DEFORMING_MAP_NAME,
     PAGE_NAME,
@@ -105,11 +106,10 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
                 if _followed(surfels):
                     surface.take(surfels)
         write_tum(folder / TRAJECTORY_NAME, _trajectory(followed))
-        report = _report(run, counts, len(followed))
+        refusal = None
         if _moves_on_own_map(run.recorded.metadata):
-            report["deforming_map"] = write_deforming_map(
-                folder / DEFORMING_MAP_NAME, recording, run
-            )
+            refusal = write_deforming_map(folder / DEFORMING_MAP_NAME, recording, run)
+        report = _report(run, counts, len(followed), refusal)
         text = json.dumps(report, indent=1) + "\n"
         (folder / REPORT_NAME).write_text(text, encoding="utf-8")
         names = {path.name for path in folder.iterdir()} | {RECORDING_NAME}
@@ -251,7 +251,8 @@ def _stands_still(metadata: Mapping[str, Mapping[str, str]]) -> bool:
     return recorded_config(metadata, []).surfels.camera == "static"
 
 
-def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
+def _report(run: Run, counts: _Counts, followed: int, refusal: str | None = None) -> dict[str, Any]:
+    """refusal: why there is no map that deforms; None if it is not made."""
     frames = len(counts.alive)
     spent_ns = counts.arrivals_ns[-1] - counts.arrivals_ns[0] if frames else 0
     missing = counts.missing
@@ -274,6 +275,7 @@ def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
         depth_from=depth_from,
         unusable=len(counts.notes) - contradicted,
         contradicted=contradicted,
+        map_problem=refusal if refusal and refusal != NO_MAP and is_evidence(refusal) else "",
         together=len(counts.together.frames) if _stands_still(run.recorded.metadata) else 0,
         broken=len(broken_images(without_pixels)),
         absent=absent_frames(run, frames),
@@ -309,4 +311,5 @@ def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
         "last_states": counts.last_states,
         "scale_is_metric": bool(counts.segments) and is_metric(run.recorded.metadata),
         **process_figures(run, frames),
+        **({} if refusal is None else {"deforming_map": refusal}),
     }

@@ -30,7 +30,7 @@ _MIN_SURFELS = 30
 _MAX_DISAGREEMENT = 0.02
 """Maximum relative difference between a surfel's depth and the map's, after the median."""
 _AROUND_PX = 2
-"""The depth of a surfel is the median of the depths up to so many pixels away."""
+"""The measured depth of a surfel is the median over a square that extends this far from it."""
 _REACH = 2.0
 """Surfels within this many patch sides decide whether a depth is right."""
 
