@@ -271,6 +271,18 @@ def test_a_file_is_looked_into_while_its_readers_start() -> None:
     assert read == [0, 1, 2, 3]
 
 
+def test_a_data_set_played_live_begins_when_its_readers_are_ready() -> None:
+    """Otherwise its first images pass while they start, and while the first one is read."""
+    read, ready_s = list[int](), list[float]()
+
+    def ready() -> None:
+        assert read
+        ready_s.append(time.time())
+
+    frames = list(ingest.newest(FakeDataset([png(0)], before=read.append), lambda: False, ready))
+    assert frames[0].captured_s >= ready_s[0]
+
+
 @pytest.mark.parametrize("is_live", [False, True])
 def test_stopping_ends_after_the_frame_at_hand(is_live: bool) -> None:
     taken: list[int] = []

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import pliant
+from pliant.algorithms.geometry import inverse, transform
+from pliant.algorithms.surfels.final_surfels import FinalSurfels
 from pliant.algorithms.surfels.surface import surface_of
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import config_yaml, load_config
@@ -18,12 +20,23 @@ from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import ResultError
 from pliant.export.export import export_result
 from pliant.export.kinds import OF_STILL_SCENES
+from pliant.formats.npz import NpzWriter
+from pliant.formats.tum import read_tum
 from pliant.messages import codec, topics
 from pliant.messages.types import CONTRADICTED, Surfels
 from pliant.recording.reader import Recording
 from pliant.recording.writer import RecordingWriter
-from pliant.results.folder import RECORDING_NAME, run_metadata
-from pliant.results.surfels import recorded_surfels, surfel_summary
+from pliant.results.folder import (
+    DEFORMING_MAP_NAME,
+    ONLINE_NAME,
+    RECORDING_NAME,
+    SURFELS_NAME,
+    TRAJECTORY_NAME,
+    files_of,
+    run_metadata,
+)
+from pliant.results.surfel_frames import add_final, final_surfels, recorded_surfels
+from pliant.results.surfels import surfel_summary
 from pliant.results.write import write_results
 from pliant_services.nodes import ingest, surfels
 from pliant_services.runtime.monitor import SilentMonitor
@@ -274,3 +287,108 @@ def read_glb(path: Path) -> tuple[dict[str, Any], list[Any]]:
         for sampler in animation["samplers"]:
             assert "min" in document["accessors"][sampler["input"]]
     return document, arrays
+
+
+def final_of(recording: Path) -> FinalSurfels:
+    """Another camera in all frames but the last, and depths that are too small by a tenth."""
+    frames = list(recorded_surfels(recording))[:-1]
+    T = np.array([each.T_world_camera for each in frames])
+    T[:, :3, 3] += (0.1, 0.0, 0.0)
+    ids = frames[0].ids
+    return FinalSurfels(
+        frames=np.array([each.frame for each in frames]),
+        T_world_camera=T,
+        segments=np.full(len(ids), frames[0].segment),
+        ids=ids,
+        factor_stamps_ns=np.full(len(ids), frames[0].stamp_ns),
+        factors=np.full(len(ids), 1.1, np.float32),
+    )
+
+
+def written_map(recording: Path, path: Path) -> None:
+    with NpzWriter(path) as npz:
+        add_final(npz, final_of(recording))
+
+
+def test_all_readers_have_the_surfels_of_the_final_map(tmp_path: Path) -> None:
+    record(tmp_path, "sensor")
+    recording = tmp_path / RECORDING_NAME
+    written_map(recording, tmp_path / DEFORMING_MAP_NAME)
+    online, final = (list(read(recording)) for read in (recorded_surfels, final_surfels))
+    for before, after in zip(online[:-1], final[:-1], strict=True):
+        moved = after.T_world_camera[:3, 3] - before.T_world_camera[:3, 3]
+        np.testing.assert_allclose(moved, [0.1, 0.0, 0.0], atol=1e-12)
+        depths = [transform(inverse(s.T_world_camera), s.positions) for s in (before, after)]
+        np.testing.assert_allclose(depths[1], 1.1 * depths[0], rtol=1e-6, atol=1e-12)
+    np.testing.assert_array_equal(final[-1].positions, online[-1].positions)
+    result = pliant.open(tmp_path)
+    for here, there in zip(result.surfels(), final, strict=True):
+        np.testing.assert_array_equal(here.positions, there.positions)
+    rows, _, _ = surface_of(final[1])
+    np.testing.assert_array_equal(
+        result.surface(1).positions, final[1].positions[rows].astype(np.float32)
+    )
+    poses = [each.T_world_camera for each in final]
+    np.testing.assert_array_equal(result.trajectory.T_world_camera, poses)
+    tracks = export_result(tmp_path, "tracks", tmp_path / "tracks")
+    with np.load(tracks / "tracks.npz") as found:
+        np.testing.assert_array_equal(found["T_world_camera"], poses)
+        known = np.isfinite(found["positions"][1, :, 0])
+        tracked = final[1].state == 0
+        np.testing.assert_array_equal(found["positions"][1, known], final[1].positions[tracked])
+    places = {"final": tmp_path, "online": tmp_path / "alone"}
+    places["online"].mkdir()
+    (places["online"] / RECORDING_NAME).hardlink_to(recording)
+    surfaces = [export_result(at, "surface", tmp_path / name) for name, at in places.items()]
+    same = [
+        (surfaces[0] / name).read_bytes() == (surfaces[1] / name).read_bytes()
+        for name in (f"{frame:06d}.ply" for frame in range(FRAMES))
+    ]
+    assert same == [False] * (FRAMES - 1) + [True]
+    animated = [
+        export_result(at, "animation", tmp_path / f"{name}.glb").read_bytes()
+        for name, at in places.items()
+    ]
+    assert animated[0] != animated[1]
+
+
+def test_files_have_the_final_surfels_and_the_online_trajectory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record(tmp_path, "sensor")
+    recording = tmp_path / RECORDING_NAME
+    write_results(tmp_path)
+    as_before = (tmp_path / SURFELS_NAME).read_bytes()
+    monkeypatch.setattr("pliant.results.surfels._moves_on_own_map", lambda _: True)
+    assert write_results(tmp_path)["deforming_map"] == "the run has no map"
+    assert not (tmp_path / ONLINE_NAME).exists()
+    assert (tmp_path / SURFELS_NAME).read_bytes() == as_before
+
+    def made(path: Path, *_: Any) -> str:
+        written_map(recording, path)
+        return ""
+
+    monkeypatch.setattr("pliant.results.surfels.write_deforming_map", made)
+    report = write_results(recording.parent)
+    assert report["deforming_map"] == ""
+    assert {ONLINE_NAME, DEFORMING_MAP_NAME} <= set(files_of(recording.parent, report))
+    frames = {"online": list(recorded_surfels(recording)), "": list(final_surfels(recording))}
+    for name, path in (("online", ONLINE_NAME), ("", TRAJECTORY_NAME)):
+        poses = read_tum(recording.parent / path).T_world_camera
+        np.testing.assert_allclose(poses, [f.T_world_camera for f in frames[name]], atol=1e-6)
+    with np.load(recording.parent / SURFELS_NAME) as found:
+        positions = np.concatenate([frame.positions for frame in frames[""]])
+        np.testing.assert_array_equal(found["positions"], positions)
+    page = (recording.parent / "report.html").read_text()
+    assert "Cameras and surfels are those of the map of the whole run" in page
+
+
+def test_a_file_that_is_no_map_is_named_and_an_older_one_changes_nothing(tmp_path: Path) -> None:
+    record(tmp_path, "sensor")
+    file, recording = tmp_path / DEFORMING_MAP_NAME, tmp_path / RECORDING_NAME
+    np.savez(file, frames=np.arange(3))
+    for online, final in zip(recorded_surfels(recording), final_surfels(recording), strict=True):
+        np.testing.assert_array_equal(final.positions, online.positions)
+    file.write_bytes(b"no zip")
+    with pytest.raises(ResultError, match="no valid map: remove the file"):
+        final_surfels(recording)

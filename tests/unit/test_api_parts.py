@@ -122,7 +122,9 @@ def walk(count: int = 60) -> pliant.Trajectory:
 def test_ground_truth_is_read_and_compared(tmp_path: Path) -> None:
     truth = walk()
     write_tum(tmp_path / "groundtruth.txt", truth)
-    for path in (tmp_path, tmp_path / "groundtruth.txt", str(tmp_path)):
+    text = (tmp_path / "groundtruth.txt").read_text()
+    (tmp_path / "windows.txt").write_text(text, encoding="utf-16")
+    for path in (tmp_path, tmp_path / "groundtruth.txt", str(tmp_path), tmp_path / "windows.txt"):
         read = pliant.read_trajectory(path)
         np.testing.assert_allclose(read.positions, truth.positions, atol=1e-6)
     found = pliant.Trajectory(stamps_ns=truth.stamps_ns, T_world_camera=truth.T_world_camera.copy())

@@ -29,6 +29,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "programs": set(),
     "version": set(),
     "wording": set(),
+    "text_files": set(),
     "yaml_text": set(),
     "trajectory": {"algorithms"},
     "formats": {"formats", "algorithms", "errors", "files", "trajectory"},
@@ -55,7 +56,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "fusion": {"fusion", "algorithms", "errors", "map_history"},
 }
 # They import nothing of ours; ``pliant`` is of the top.
-ANYWHERE = {"exit_codes", "programs", "version", "wording", "yaml_text"}
+ANYWHERE = {"exit_codes", "programs", "text_files", "version", "wording", "yaml_text"}
 PURE_FORBIDS = {"time", "datetime", "socket", "logging", "os", "pathlib", "random", "threading"}
 
 

@@ -133,6 +133,14 @@ def test_lists_may_be_separated_and_commented_in_many_ways(tmp_path: Path, separ
     assert stamps(open_source(str(folder))) == [500000000, 1500000000, 2500000000]
 
 
+def test_lists_may_be_utf_16(tmp_path: Path) -> None:
+    """As the shell of Windows writes them."""
+    folder = listed_folder(tmp_path)
+    rows = [f"{i}.5 images/00{i}.png" for i in range(3)]
+    (folder / "rgb.txt").write_text("\r\n".join(rows), encoding="utf-16")
+    assert stamps(open_source(str(folder))) == [500000000, 1500000000, 2500000000]
+
+
 def test_file_names_with_spaces(tmp_path: Path) -> None:
     folder = listed_folder(tmp_path)
     write_images(folder / "my images", ["a b.png"])

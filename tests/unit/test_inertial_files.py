@@ -70,6 +70,13 @@ def test_names_and_units_of_the_header(
     assert found.accel_m_s2[3] == pytest.approx(ACCEL, rel=1e-6)
 
 
+def test_a_table_in_utf_16(tmp_path: Path) -> None:
+    file = write(tmp_path / "a.csv", "t,gx,gy,gz,ax,ay,az", rows())
+    plain = read_csv(file).imu
+    file.write_text(file.read_text(), encoding="utf-16")
+    np.testing.assert_array_equal(read_csv(file).imu.stamps_ns, plain.stamps_ns)
+
+
 def test_decimal_commas(tmp_path: Path) -> None:
     header = "Time (s);wx (rad/s);wy (rad/s);wz (rad/s);ax (m/s^2);ay (m/s^2);az (m/s^2)"
     made: list[list[object]] = [

@@ -183,8 +183,12 @@ def newest(
 
     ready: returns when readers are, and only then the newest is chosen: no image waits in front of
     them but the one that they take next.  A source that is not a camera is played at the pace of
-    its own time stamps.
+    its own time stamps, once its first frame is read and readers are ready.
     """
+    frames = iter(dataset)
+    if not dataset.is_live:
+        frames = begun(frames)
+        ready()
     slot: list[SourceFrame] = []
     failure: list[BaseException] = []
     changed = threading.Condition()
@@ -203,7 +207,7 @@ def newest(
     def play() -> None:
         start_s, first_ns = time.monotonic(), None
         started_s = time.time()
-        for frame in dataset:
+        for frame in frames:
             first_ns = frame.stamp_ns if first_ns is None else first_ns
             captured_s = time.time()
             if not dataset.is_live:
@@ -224,13 +228,12 @@ def newest(
         while True:
             with changed:
                 changed.wait_for(lambda: slot or finished.is_set(), timeout=1.0)
-                came = bool(slot)
-            if came:
+            if slot:
                 ready()
             with changed:
-                frames, slot[:] = slot[:], []
+                came, slot[:] = slot[:], []
                 over = finished.is_set()
-            yield from frames
+            yield from came
             if stopping():
                 return
             if over and not slot:

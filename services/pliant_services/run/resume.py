@@ -69,7 +69,8 @@ def has_ended(output: Path, services: Sequence[str], config: Config) -> bool:
 
 def check_ended(output: Path, config: Config) -> None:
     """Raise ResultError if a run without checkpoints was not recorded to its end."""
-    from pliant.results.surfels import has_surfels  # loads modules that a launcher does not need
+    # It loads modules that a launcher does not need.
+    from pliant.results.surfel_frames import has_surfels
 
     deformable = has_surfels(output / RECORDING_NAME)
     rigid = "rigid" if config.meshing.enabled else "points"

@@ -2,7 +2,7 @@
 
 import base64
 import html
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice
@@ -33,11 +33,12 @@ from pliant.pictures.map import choose_view, render_map
 from pliant.recording import parts
 from pliant.recording.reader import Recording
 from pliant.results.calibration import found_calibration
-from pliant.results.folder import RECORDING_NAME
+from pliant.results.folder import DEFORMING_MAP_NAME, RECORDING_NAME
 from pliant.results.mesh_files import mesh_of
 from pliant.results.report import rigid_report
 from pliant.results.run import Run, read_run, seen_by_keyframes
-from pliant.results.surfels import has_surfels, recorded_surfels, surfel_report, surfel_trajectory
+from pliant.results.surfel_frames import corrector, final_surfels, has_surfels
+from pliant.results.surfels import surfel_report, surfel_trajectory
 from pliant.results.verdict import summary
 from pliant.trajectory import Trajectory
 
@@ -169,8 +170,8 @@ class Result(Mapped):
         return grey if colour is None else colour
 
     def surfels(self) -> Iterator[Surfels]:
-        """The surfels of a deforming scene, in every frame."""
-        return recorded_surfels(self._recording.path)
+        """The surfels of a deforming scene, in every frame, by the final map if there is one."""
+        return final_surfels(self._recording.path)
 
     def surface(self, frame: int) -> Surface:
         """The surface of a deforming scene in a frame: a mesh of its tracked surfels, in the world
@@ -182,6 +183,7 @@ class Result(Mapped):
         assert isinstance(surfels, Surfels)
         if surfels.missing:
             raise ResultError(f"{self.path}: frame {frame} has no surfels: {surfels.missing}")
+        surfels = self._final(surfels)
         rows, normals, triangles = surface_of(surfels)
         colours = np.full((len(rows), 3), _GREY, np.uint8)
         if next(self._recording.messages(topics.SOURCE), None) is not None:
@@ -229,6 +231,10 @@ class Result(Mapped):
     @cached_property
     def _rectifier(self) -> Rectifier:
         return Rectifier(calibration_from_yaml(self._stream.calibration))
+
+    @cached_property
+    def _final(self) -> Callable[[Surfels], Surfels]:
+        return corrector(self._recording.path.parent / DEFORMING_MAP_NAME)
 
     @cached_property
     def _images(self) -> RecordedImages:

@@ -1,15 +1,14 @@
 """Calibration files as text, whatever they are written in: Latin-1, UTF-16, COLMAP's binary."""
 
-import codecs
 import struct
 from pathlib import Path
 
 from pliant.errors import CalibrationError
+from pliant.text_files import decoded
 
 _MAX_BYTES = 1 << 20
 _MAX_JSON_BYTES = 1 << 26
 """A transforms.json has the pose of every image."""
-_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _COLMAP_MODELS = (
     *(("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8)),
     *(("OPENCV_FISHEYE", 8), ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4)),
@@ -32,7 +31,7 @@ def calibration_text(file: Path) -> str:
     if file.suffix == ".bin":
         return _colmap_text(data, file)
     try:
-        text = data.decode("utf-16" if data.startswith(_UTF_16) else "utf-8-sig")
+        text = decoded(data)
     except UnicodeDecodeError:
         text = data.decode("latin-1")  # what editors of old write
     if "\0" in text or any(0x7F <= ord(letter) < 0xA0 for letter in text):

@@ -16,6 +16,7 @@ from pliant.datasets.frame_times import increasing, why_wrong
 from pliant.datasets.images import ListedImage, image_files
 from pliant.datasets.times import likely_unit, nanoseconds, number_of, rate
 from pliant.errors import DatasetError
+from pliant.text_files import decoded
 from pliant.wording import counted, shortened, shown
 
 _LINE = re.compile(r"([^\s,;]+)[\s,;]+(\S.*)")
@@ -39,7 +40,7 @@ class ImageList:
 def data_lines(file: Path) -> Iterator[tuple[int, str]]:
     """(number from 1, text) of the lines of a list that are neither empty nor comments."""
     try:
-        text = file.read_text(encoding="utf-8-sig")
+        text = decoded(file.read_bytes())
     except FileNotFoundError:
         raise DatasetError(f"{file}: missing; every image needs its time stamp there") from None
     except UnicodeDecodeError:

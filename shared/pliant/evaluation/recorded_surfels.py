@@ -23,9 +23,11 @@ from pliant.evaluation.exact_surfels import ExactSurfels, format_exact
 from pliant.evaluation.later_surfels import LaterSurfels, format_later, scaled, true_scale
 from pliant.evaluation.surface_truth import SurfaceTruth
 from pliant.evaluation.surfel_truth import SurfelTruth, format_surfels, mean_rows
+from pliant.messages.types import Surfels
 from pliant.recording.reader import Recording
 from pliant.results.folder import DEFORMING_MAP_NAME, RECORDING_NAME
-from pliant.results.surfels import is_metric, recorded_surfels
+from pliant.results.surfel_frames import final_surfels, recorded_surfels
+from pliant.results.surfels import is_metric
 
 
 def surfels_against_truth(result: Path, source: str, figures: dict[str, Any]) -> Iterator[str]:
@@ -41,7 +43,7 @@ def surfels_against_truth(result: Path, source: str, figures: dict[str, Any]) ->
     rectifier, depths = Rectifier(dataset.calibration), DepthRectifier(dataset.calibration)
     truth = SurfelTruth(rectifier.camera)
     for surfels, frame in zip(
-        recorded_surfels(result / RECORDING_NAME), dataset, strict=False
+        final_surfels(result / RECORDING_NAME), dataset, strict=False
     ):  # a run that was stopped is judged as far as it came
         if surfels.missing or not frame.depth:
             continue
@@ -63,24 +65,40 @@ def surfels_against_truth(result: Path, source: str, figures: dict[str, Any]) ->
 def _against_surfaces(result: Path, folder: Path, figures: dict[str, Any]) -> str:
     dataset = open_source(str(folder))
     truth = SurfaceTruth(folder, Rectifier(dataset.calibration).camera)
-    judge, later = ExactSurfels(truth), LaterSurfels(truth)
+    recording = result / RECORDING_NAME
     # Where the scale is arbitrary, that of the first surfels is given, once for the whole run.
-    scale = 1.0 if is_metric(Recording(result / RECORDING_NAME).metadata()) else None
-    for surfels in recorded_surfels(result / RECORDING_NAME):
-        if surfels.frame >= len(truth):
+    scale = 1.0 if is_metric(Recording(recording).metadata()) else None
+    figures["surfels"], text = _exact(result, final_surfels(recording), truth, scale)
+    if (result / DEFORMING_MAP_NAME).is_file():
+        errors = judge_deforming_map(result / DEFORMING_MAP_NAME, truth)
+        figures["final_map"] = asdict(errors)
+        figures["surfels_online"], online = _exact(
+            result, recorded_surfels(recording), truth, scale
+        )
+        text = f"final\n{text}\n{format_deforming_map(errors)}\n\nonline\n{online}"
+    return text
+
+
+def _exact(
+    result: Path, surfels: Iterator[Surfels], truth: SurfaceTruth, scale: float | None
+) -> tuple[dict[str, Any], str]:
+    """Figures and text.  scale: metres by a unit; None: that of the first surfels."""
+    judge, later = ExactSurfels(truth), LaterSurfels(truth)
+    for each in surfels:
+        if each.frame >= len(truth):
             raise ResultError(
-                f"{result}: has more frames than {folder}: pass the sequence of this run"
+                f"{result}: has more frames than ground truth: pass the sequence of this run"
             )
-        if surfels.missing or (scale is None and not len(surfels.ids)):
+        if each.missing or (scale is None and not len(each.ids)):
             continue
-        scale = scale or true_scale(surfels.frame, surfels, truth)
-        judge.add(surfels.frame, scaled(surfels, scale))
-        later.add(surfels.frame, scaled(surfels, scale))
+        scale = scale or true_scale(each.frame, each, truth)
+        judge.add(each.frame, scaled(each, scale))
+        later.add(each.frame, scaled(each, scale))
     if not judge.rows:
         raise ResultError(_nothing(result))
     false, true, _ = judge.curve()
     kept = np.unique(np.linspace(0, len(false) - 1, 200).astype(int)) if len(false) else []
-    figures["surfels"] = {
+    figures = {
         "frames": [asdict(row) for row in judge.rows],
         "summary": judge.summary(),
         "scale": scale,
@@ -90,13 +108,7 @@ def _against_surfaces(result: Path, folder: Path, figures: dict[str, Any]) -> st
         "roc": {"false_positive": false[kept].tolist(), "true_positive": true[kept].tolist()},
     }
     text = format_exact(judge, moving_camera=truth.moving_camera)
-    if later.summary()["births"]:
-        text += "\n" + format_later(later)
-    if (result / DEFORMING_MAP_NAME).is_file():
-        errors = judge_deforming_map(result / DEFORMING_MAP_NAME, truth)
-        figures["final_map"] = asdict(errors)
-        text += "\n" + format_deforming_map(errors)
-    return text
+    return figures, f"{text}\n{format_later(later)}" if later.summary()["births"] else text
 
 
 def _nothing(result: Path) -> str:

@@ -24,6 +24,7 @@ from pliant.evaluation.run_report import RunReport, read_run_report
 from pliant.evaluation.time_offset import TimeOffset, better_offset, offset_ns, shifted
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.formats.tum import read_tum
+from pliant.results.folder import ONLINE_NAME
 from pliant.trajectory import (
     MAX_DIFFERENCE_NS,
     Trajectory,
@@ -38,7 +39,6 @@ MAX_SHARE = 0.5
 """With an error above this share of the spread of the true positions it may be, too."""
 
 FINAL_NAME = "trajectory.txt"
-ONLINE_NAME = "trajectory_online.txt"
 
 
 @dataclass(frozen=True, kw_only=True)

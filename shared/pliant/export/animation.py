@@ -14,7 +14,8 @@ from pliant.export.surface_meshes import check_deformable, colours_at, surfels_w
 from pliant.formats.animated import AnimatedMesh, write_animated_glb
 from pliant.messages.types import Surfels
 from pliant.recording.reader import Recording
-from pliant.results.surfels import is_metric, recorded_surfels
+from pliant.results.surfel_frames import final_surfels
+from pliant.results.surfels import is_metric
 
 _KEYS = 60
 """Most key frames unless every Nth is given: the file grows with them, and with the surfels."""
@@ -97,9 +98,7 @@ def animated(
 def _longest_segment(recording: Recording) -> tuple[int, I64]:
     """The first of those with the most frames in which surfels were followed, and these frames."""
     followed = [
-        (s.segment, s.frame)
-        for s in recorded_surfels(recording.path)
-        if not s.missing and not s.lost
+        (s.segment, s.frame) for s in final_surfels(recording.path) if not s.missing and not s.lost
     ]
     if not followed:
         return 0, np.zeros(0, np.int64)

@@ -51,7 +51,8 @@ from pliant.results.folder import RECORDING_NAME, check_free, files_read, keep_a
 from pliant.results.known_scale import MetricRecording
 from pliant.results.mesh_files import mesh_of
 from pliant.results.run import Run, read_run
-from pliant.results.surfels import has_surfels, surfel_trajectory
+from pliant.results.surfel_frames import has_surfels
+from pliant.results.surfels import surfel_trajectory
 from pliant.staging import put_tree_in_place, staging
 from pliant.trajectory import Trajectory
 

@@ -16,7 +16,7 @@ from pliant.messages.types import Surfels
 from pliant.pictures.masked import dimmed
 from pliant.pictures.overlay import draw_marks
 from pliant.recording.reader import Recording
-from pliant.results.surfels import has_surfels, recorded_surfels
+from pliant.results.surfel_frames import final_surfels, has_surfels
 from pliant.viewers.surfel_quads import surfel_picture
 
 
@@ -46,7 +46,7 @@ def surfels_with_images(
     images = rectified_images(recording, camera_of(recording)) if has_images else iter(())
     pixels: U8 | None = None
     seen = -1
-    for surfels in recorded_surfels(recording.path):
+    for surfels in final_surfels(recording.path):
         if surfels.missing or not wanted(surfels):
             continue
         while seen < surfels.frame:
@@ -72,7 +72,7 @@ def overlay_pictures(recording: Recording) -> Iterator[U8]:
         SurfelState.OCCLUDED: "occluded (violet)",
         SurfelState.LOST: "lost",
     }
-    for surfels in recorded_surfels(recording.path):
+    for surfels in final_surfels(recording.path):
         if surfels.missing:
             continue
         image = next(each for each in images if each.number == surfels.frame)

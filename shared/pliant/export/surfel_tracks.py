@@ -13,7 +13,8 @@ from pliant.formats.npz import NpzWriter
 from pliant.formats.text import format_seconds
 from pliant.messages.types import Surfels
 from pliant.recording.reader import Recording
-from pliant.results.surfels import is_metric, recorded_surfels
+from pliant.results.surfel_frames import final_surfels
+from pliant.results.surfels import is_metric
 
 
 def surfel_tracks(recording: Recording, path: Path, folder: Path | None, every: int = 1) -> None:
@@ -46,7 +47,7 @@ def surfel_tracks(recording: Recording, path: Path, folder: Path | None, every: 
 
 def _frames(recording: Recording, every: int) -> Iterator[Surfels]:
     """Yield the frames with surfels."""
-    for surfels in recorded_surfels(recording.path):
+    for surfels in final_surfels(recording.path):
         if not surfels.missing and surfels.frame % every == 0:
             yield surfels
 

@@ -9,6 +9,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64, I64
 from pliant.errors import ResultError
 from pliant.files import write_whole
+from pliant.text_files import decoded
 from pliant.trajectory import Trajectory
 
 QUATERNION_TOLERANCE = 0.01
@@ -21,7 +22,7 @@ _SHOWN = 40
 def numbered_lines(path: Path) -> Iterator[tuple[int, str]]:
     """Line numbers (from 1) and text, without blank lines and comments (#)."""
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        text = decoded(path.read_bytes())
     except FileNotFoundError:
         raise ResultError(f"{path}: no such file") from None
     except IsADirectoryError:

@@ -3,14 +3,16 @@
 It is made only where it can be trusted: see ``held_out.py``.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.deformable.judged_map import INTERVAL_NS, TOO_FEW, judged_map
+from pliant.algorithms.deformable.followed_map import FollowedMap
+from pliant.algorithms.deformable.judged_map import INTERVAL_NS, TOO_FEW, JudgedMap, judged_map
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.slam.calibration.corrected_view import corrected_view
 from pliant.formats.npz import NpzWriter
@@ -19,16 +21,27 @@ from pliant.messages import topics
 from pliant.messages.types import Extrema
 from pliant.recording.reader import Recording
 from pliant.results.run import Run
+from pliant.results.surfel_frames import add_final, recorded_surfels, surfels_by_map
 
 _MOST = 150
 """Keyframes; a longer run has them farther apart."""
 NO_MAP = "the run has no map"
 
 
-def write_deforming_map(path: Path, recording: Path, run: Run) -> str:
-    """Adjust the longest segment of a run's map.  Returns why it cannot be, "" where it can.
+@dataclass(frozen=True)
+class _Map:
+    """frames, stamps_ns: (K,) of the keyframes of a map that is to be trusted."""
 
-    Cameras, landmarks and displacements are in world and unit of the map.
+    judged: JudgedMap
+    frames: I64
+    stamps_ns: I64
+
+
+def write_deforming_map(path: Path, recording: Path, run: Run) -> str:
+    """Adjust the longest segment of a run's map, and correct its surfels by it.
+
+    Returns why it cannot be, "" where it can.  Cameras, landmarks and displacements are in world
+    and unit of the map.
     """
     segment = run.history.longest_segment()
     if run.stream is None or segment < 0:
@@ -36,19 +49,39 @@ def write_deforming_map(path: Path, recording: Path, run: Run) -> str:
     # A rigid map that deforms estimates a wrong correction: a calibration that is given counts.
     correction = run.correction_of(segment) if run.stream.focal_sigma > 0.0 else ()
     view = corrected_view(run.stream.camera, correction)
-    tracks = Recording(recording).decoded(topics.EXTREMA)
-    seen = (
-        (t.frame, t.ids, view.pixels(t.points_px).astype(np.float64))
-        for t in tracks
-        if isinstance(t, Extrema)
-    )
-    return adjust_and_write(path, run.history, view.camera, seen)
+
+    def tracks() -> Iterator[tuple[int, I64, F64]]:
+        for t in Recording(recording).decoded(topics.EXTREMA):
+            if isinstance(t, Extrema):
+                yield t.frame, t.ids, view.pixels(t.points_px).astype(np.float64)
+
+    made = _adjusted(run.history, view.camera, tracks())
+    if isinstance(made, str):
+        return made
+    followed = FollowedMap(made.judged.found, made.judged.ids, made.stamps_ns)
+    final = surfels_by_map(followed, tracks(), recorded_surfels(recording), view.camera)
+    with NpzWriter(path) as npz:
+        _add(npz, made)
+        add_final(npz, final)
+    return ""
 
 
 def adjust_and_write(
     path: Path, history: MapHistory, camera: PinholeCamera, tracks: Iterable[tuple[int, I64, F64]]
 ) -> str:
-    """The same for a map and the frames, ids (N,) and pixels (N, 2) of its tracks."""
+    """The same for a map and the frames, ids (N,) and pixels (N, 2) of its tracks, no surfels."""
+    made = _adjusted(history, camera, tracks)
+    if isinstance(made, str):
+        return made
+    with NpzWriter(path) as npz:
+        _add(npz, made)
+    return ""
+
+
+def _adjusted(
+    history: MapHistory, camera: PinholeCamera, tracks: Iterable[tuple[int, I64, F64]]
+) -> _Map | str:
+    """The map, or why it is not to be trusted."""
     segment = history.longest_segment()
     poses = {frame: pose for frame, (of, pose) in history.final().items() if of == segment}
     frames = _spread(np.array(sorted(poses), np.int64), history.stamps_ns)
@@ -62,24 +95,25 @@ def adjust_and_write(
     judged = judged_map(ids, pixels, T, camera)
     if isinstance(judged, str):
         return judged
-    if judged.problem:
-        return judged.problem
-    found, chosen, landmarks = judged.found, judged.tracks, judged.ids
-    tracked = np.full((len(frames), len(landmarks), 2), np.nan, np.float32)
+    stamps_ns = np.array([history.stamps_ns[frame] for frame in frames.tolist()], np.int64)
+    return judged.problem or _Map(judged, frames, stamps_ns)
+
+
+def _add(npz: NpzWriter, made: _Map) -> None:
+    found, chosen, landmarks = made.judged.found, made.judged.tracks, made.judged.ids
+    tracked = np.full((len(made.frames), len(landmarks), 2), np.nan, np.float32)
     tracked[chosen.keyframes, chosen.landmarks] = chosen.points_px
     kept = np.flatnonzero(found.reliable)
-    with NpzWriter(path) as npz:
-        npz.add("frames", frames)
-        npz.add("stamps_ns", np.array([history.stamps_ns[f] for f in frames.tolist()], np.int64))
-        npz.add("T_world_camera", found.T_world_camera)
-        npz.add("ids", landmarks[kept])
-        npz.add("rest", found.rest[kept])
-        npz.add("nodes", found.nodes)
-        npz.add("displacements", found.displacements)
-        npz.add("carriers", found.carriers[kept])
-        npz.add("weights", found.weights[kept])
-        npz.add("points_px", tracked[:, kept])
-    return ""
+    npz.add("frames", made.frames)
+    npz.add("stamps_ns", made.stamps_ns)
+    npz.add("T_world_camera", found.T_world_camera)
+    npz.add("ids", landmarks[kept])
+    npz.add("rest", found.rest[kept])
+    npz.add("nodes", found.nodes)
+    npz.add("displacements", found.displacements)
+    npz.add("carriers", found.carriers[kept])
+    npz.add("weights", found.weights[kept])
+    npz.add("points_px", tracked[:, kept])
 
 
 def _spread(frames: I64, stamps_ns: dict[int, int]) -> I64:

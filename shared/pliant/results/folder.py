@@ -37,11 +37,12 @@ SESSION_NAME = "session.json"
 """File with the endpoint and session, during a run."""
 CALIBRATION_NAME = "calibration.yaml"
 TRAJECTORY_NAME = "trajectory.txt"
+ONLINE_NAME = "trajectory_online.txt"
 SURFELS_NAME = "surfels.npz"
 DEFORMING_MAP_NAME = "deforming_map.npz"
 _RIGID_FILES = (
     TRAJECTORY_NAME,
-    "trajectory_online.txt",
+    ONLINE_NAME,
     "keyframes.txt",
     "points.ply",
     CALIBRATION_NAME,
@@ -398,5 +399,8 @@ def commit_of(package: Path) -> str:
 
 def files_of(output: Path, report: dict[str, Any]) -> list[str]:
     """Names of the files of a run with this report, except its recording."""
-    always = SURFEL_FILES if report.get("profile") == "deformable" else _RIGID_FILES
-    return [*always, *(name for name in (*SOMETIMES, *MESH_FILES) if (output / name).exists())]
+    if report.get("profile") == "deformable":
+        always, sometimes = SURFEL_FILES, (ONLINE_NAME, *SOMETIMES)
+    else:
+        always, sometimes = _RIGID_FILES, (*SOMETIMES, *MESH_FILES)
+    return [*always, *(name for name in sometimes if (output / name).exists())]

@@ -1,7 +1,7 @@
 """Turns a recording of surfels into the files that a user opens: see docs/surfels.md."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from pliant.recording.reader import Recording
 from pliant.results.deforming_map import NO_MAP, write_deforming_map
 from pliant.results.folder import (
     DEFORMING_MAP_NAME,
+    ONLINE_NAME,
     PAGE_NAME,
     RECORDING_NAME,
     REPORT_NAME,
@@ -46,6 +47,7 @@ from pliant.results.report import (
     source_failed,
 )
 from pliant.results.run import Run, read_run
+from pliant.results.surfel_frames import corrector, final_surfels
 from pliant.trajectory import Trajectory
 from pliant.wording import counted
 
@@ -74,18 +76,6 @@ class _Counts:
     together: MovingTogether = field(default_factory=MovingTogether)
 
 
-def has_surfels(recording: Path) -> bool:
-    """Whether a recording is one of the deformable profile."""
-    return next(Recording(recording).messages(topics.SURFELS), None) is not None
-
-
-def recorded_surfels(recording: Path) -> Iterator[Surfels]:
-    """The surfels of every frame."""
-    for message in Recording(recording).decoded(topics.SURFELS):
-        assert isinstance(message, Surfels)
-        yield message
-
-
 def write_surfel_results(output: Path) -> dict[str, Any]:
     """Write trajectory, surfels and report beside the recording; returns the report.
 
@@ -95,21 +85,27 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
     run, counts = read_run(recording), _Counts()
     followed: list[tuple[int, F64]] = []
     surface = Surface()
+    online: list[tuple[int, F64]] = []
     with all_or_none(output) as folder:
+        makes_map, why = _moves_on_own_map(run.recorded.metadata), ""
+        if makes_map:
+            why = write_deforming_map(folder / DEFORMING_MAP_NAME, recording, run)
+        final = corrector(folder / DEFORMING_MAP_NAME)
         with NpzWriter(folder / SURFELS_NAME) as npz:
             for recorded in Recording(recording).messages(topics.SURFELS):
                 surfels = recorded.decode()
                 assert isinstance(surfels, Surfels)
                 _count(counts, surfels, recorded.log_time_ns, run.stream)
+                online += _followed(surfels)
+                surfels = final(surfels)
                 _add(npz, surfels)
                 followed += _followed(surfels)
                 if _followed(surfels):
                     surface.take(surfels)
         write_tum(folder / TRAJECTORY_NAME, _trajectory(followed))
-        refusal = None
-        if _moves_on_own_map(run.recorded.metadata):
-            refusal = write_deforming_map(folder / DEFORMING_MAP_NAME, recording, run)
-        report = _report(run, counts, len(followed), refusal)
+        report = _report(run, counts, len(followed), why if makes_map else None)
+        if makes_map and not why:
+            write_tum(folder / ONLINE_NAME, _trajectory(online))
         text = json.dumps(report, indent=1) + "\n"
         (folder / REPORT_NAME).write_text(text, encoding="utf-8")
         names = {path.name for path in folder.iterdir()} | {RECORDING_NAME}
@@ -130,8 +126,8 @@ def surfel_report(recording: Path) -> dict[str, Any]:
 
 
 def surfel_trajectory(recording: Path) -> Trajectory:
-    """The camera's pose of every frame whose surfels were followed."""
-    return _trajectory([f for surfels in recorded_surfels(recording) for f in _followed(surfels)])
+    """The camera's final pose of every frame whose surfels were followed."""
+    return _trajectory([f for surfels in final_surfels(recording) for f in _followed(surfels)])
 
 
 def _followed(surfels: Surfels) -> list[tuple[int, F64]]:
@@ -175,6 +171,11 @@ def surfel_summary(report: dict[str, Any]) -> list[str]:
         )
     if report.get("deforming_map"):
         lines.append(f"no {DEFORMING_MAP_NAME}: {report['deforming_map']}")
+    elif "deforming_map" in report:
+        lines.append(
+            "Cameras and surfels are those of the map of the whole run, which deforms "
+            f"({ONLINE_NAME}: as they were online)"
+        )
     return lines
 
 

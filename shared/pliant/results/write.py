@@ -29,7 +29,8 @@ from pliant.results.mesh_files import write_meshes
 from pliant.results.page.rigid_page import clip_of_keyframes, drawn_map, write_page
 from pliant.results.report import rigid_report
 from pliant.results.run import Run, read_run
-from pliant.results.surfels import has_surfels, write_surfel_results
+from pliant.results.surfel_frames import has_surfels
+from pliant.results.surfels import write_surfel_results
 
 
 def write_results(output: Path) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from pliant.results.folder import RECORDING_NAME, check_free, settle_killed, wri
 from pliant.results.inertial import by_samples
 from pliant.results.known_scale import MetricRecording, Scale
 from pliant.results.run import Run, read_run
-from pliant.results.surfels import has_surfels
+from pliant.results.surfel_frames import has_surfels
 from pliant.results.write import write_rigid_results
 from pliant.scale.gps import from_gps
 from pliant.scale.lengths import from_depth, from_points

@@ -18,7 +18,7 @@ from pliant.algorithms.deformable.linearised import CAMERA, accumulate, linearis
 from pliant.algorithms.deformable.moving_landmarks import NEAREST, DeformingMap
 from pliant.algorithms.deformable.node_graph import NodeGraph, edges_of
 from pliant.algorithms.deformable.priors import Prior
-from pliant.algorithms.geometry import so3_exp
+from pliant.algorithms.geometry import inverse, so3_exp, transform
 
 _STEPS = 2
 _FEWEST = 30
@@ -52,10 +52,9 @@ class FrameCamera:
         ids, points_px: (N,) and (N, 2) its tracks, rectified.  None where too few landmarks are
         among them, or fit.
         """
-        _, rows, seen = np.intersect1d(self.ids, ids, assume_unique=True, return_indices=True)
+        rows, pixels = self._seen(ids, points_px)
         if len(rows) < _FEWEST:
             return None
-        pixels = np.ascontiguousarray(points_px[seen], np.float64)
         now = self.T_world_camera, self.displacements, np.zeros(0)
         for _ in range(_STEPS):
             now = self._stepped(*now[:2], rows, pixels, camera)
@@ -65,6 +64,19 @@ class FrameCamera:
         out = self.T_world_camera.copy()
         out[:3, 3] *= self.depth
         return out
+
+    def landmarks(self, ids: I64, points_px: F64) -> tuple[F64, F64]:
+        """(M, 3) landmarks among the tracks of the last frame, in its camera's frame and in the
+        window's unit, and their pixels (M, 2)."""
+        rows, pixels = self._seen(ids, points_px)
+        moved = self.displacements[0][self.carriers[rows]]
+        points = self.rest[rows] + np.einsum("lj,ljc->lc", self.weights[rows], moved)
+        return self.depth * transform(inverse(self.T_world_camera), points), pixels
+
+    def _seen(self, ids: I64, points_px: F64) -> tuple[I64, F64]:
+        """Rows (M,) of the landmarks among tracks, and their pixels (M, 2)."""
+        _, rows, seen = np.intersect1d(self.ids, ids, assume_unique=True, return_indices=True)
+        return rows, np.ascontiguousarray(points_px[seen], np.float64)
 
     def _stepped(
         self, T: F64, d: F64, rows: I64, pixels: F64, camera: PinholeCamera

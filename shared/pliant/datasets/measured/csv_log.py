@@ -27,6 +27,7 @@ from pliant.datasets.measured.base import (
 )
 from pliant.datasets.times import UNITS, likely_unit, nanoseconds, utc_ns
 from pliant.errors import DatasetError
+from pliant.text_files import decoded
 from pliant.wording import shown
 
 _STEP_S = 0.005
@@ -95,7 +96,7 @@ def read_csv(file: Path) -> Measurements:
 def text_lines(file: Path) -> list[str]:
     """The lines of a text file that are not empty.  Raises DatasetError."""
     try:
-        text = file.read_text(encoding="utf-8-sig", errors="replace")
+        text = decoded(file.read_bytes(), "replace")
     except OSError as error:
         raise DatasetError(f"{file}: cannot be read: {error.strerror}") from None
     return [line for line in text.splitlines() if line and not line.isspace()]

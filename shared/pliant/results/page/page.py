@@ -47,6 +47,7 @@ _FILES = {
     "mesh_coarse.ply": "the surface, coarse",
     "calibration.yaml": "the camera, for --calibration of the next run",
     "surfels.npz": "every surfel of every frame",
+    "deforming_map.npz": "the map of the whole run, which deforms",
     "report.json": "all figures",
     "map.pliant": "the map for later runs: pliant run SOURCE --map",
     "scale.yaml": "metres per unit of the recording",
