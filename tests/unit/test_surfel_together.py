@@ -79,6 +79,8 @@ def test_a_new_surfel_is_joined_to_those_around_it_alone() -> None:
     nearest = np.argsort(distance, axis=1)[:, 1 : count + 1]
     mutual = {i for i in range(new) if i in nearest[new] or new in nearest[i]}
     assert {(int(i), int(j)) for i, j in edges.ends} == {(i, new) for i in mutual}
+    widely = find_edges(poses, np.ones(len(poses), np.int64), new, count, widely=True)
+    assert {(int(i), int(j)) for i, j in widely.ends} == {(i, new) for i in range(new)}
 
 
 def test_a_stretch_that_surfels_know_of_costs_nothing() -> None:

@@ -153,12 +153,17 @@ class SurfelTable:
         ):
             setattr(self, name, np.ascontiguousarray(getattr(self, name)[rows]))
 
-    def connect(self, first_new: int, count: int, *, with_earlier: bool) -> None:
-        """Connect the rows from ``first_new`` on with their neighbours, earlier ones or not."""
+    def connect(
+        self, first_new: int, count: int, *, with_earlier: bool, widely: bool = False
+    ) -> None:
+        """Connect the rows from ``first_new`` on with their neighbours, earlier ones or not.
+
+        widely: as in ``find_edges``.
+        """
         known = self.tracked.astype(np.int64)
         if not with_earlier:
             known[:first_new] = 0
-        new = find_edges(self.guesses, known, first_new, count)
+        new = find_edges(self.guesses, known, first_new, count, widely=widely)
         self.edges = join_edges(self.edges, new)
 
     @property

@@ -264,7 +264,9 @@ class SurfelTracker:
         # The heuristic covariance of section V: a share of the surfel's depth, all directions.
         sigmas = np.maximum(p.expected_motion * births.poses[:, X + 2], 1e-9)
         table.add(births, now.T_world_camera, self._next_id, self._frame, sigmas, self._exposure())
-        table.connect(len(table) - n, p.neighbours, with_earlier=not flat)
+        # A map errs in the depth of all new surfels, which the whole surface averages.
+        widely = p.depth_from == "map"
+        table.connect(len(table) - n, p.neighbours, with_earlier=not flat, widely=widely)
         self._next_id += n
         self._followed = int(table.tracked.sum())
         now.lost = self._followed < p.min_alive
