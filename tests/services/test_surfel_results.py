@@ -2,6 +2,7 @@
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from pliant.export.kinds import OF_STILL_SCENES
 from pliant.formats.npz import NpzWriter
 from pliant.formats.tum import read_tum
 from pliant.messages import codec, topics
+from pliant.messages.types import CONTRADICTED, Surfels
+from pliant.recording.reader import Recording
 from pliant.recording.writer import RecordingWriter
 from pliant.results.folder import (
     DEFORMING_MAP_NAME,
@@ -33,6 +36,7 @@ from pliant.results.folder import (
     run_metadata,
 )
 from pliant.results.surfel_frames import add_final, final_surfels, recorded_surfels
+from pliant.results.surfels import surfel_summary
 from pliant.results.write import write_results
 from pliant_services.nodes import ingest, surfels
 from pliant_services.runtime.monitor import SilentMonitor
@@ -78,6 +82,56 @@ def test_depth_that_was_made_up_is_doubtful_and_not_in_metres(
     head = (tmp_path / "tracks" / "tracks.csv").read_text().partition("\n")[0]
     axes = "x_m,y_m,z_m" if is_metric else "x,y,z"
     assert head == f"frame,seconds,segment,id,{axes},confirmed,zncc,confidence"
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"confidence": 0.6}, "less than 75% of the surfels in view are probably right"),
+        ({"note": f"{CONTRADICTED}: 9 of the 10"}, "the depth map contradicts most surfels"),
+        ({"note": "depth/3.png: broken"}, "80% of the depth maps could not be used"),
+    ],
+)
+def test_surfels_that_are_probably_wrong_are_doubtful(
+    changed: dict[str, Any], says: str, recorded: Path, tmp_path: Path
+) -> None:
+    reader = Recording(recorded / RECORDING_NAME)
+    with RecordingWriter(tmp_path / RECORDING_NAME, reader.metadata()) as writer:
+        for topic in (topics.STREAM, topics.SURFELS):
+            for n, message in enumerate(reader.decoded(topic)):
+                if isinstance(message, Surfels) and n > 0:
+                    share = np.full_like(message.confidence, changed.get("confidence", 1.0))
+                    note = changed.get("note", "")
+                    message = replace(message, confidence=share, note=note)
+                data = codec.encode(message)
+                writer.write(topic, data, sequence=n, log_time_ns=n, publish_time_ns=n)
+    report = write_results(tmp_path)
+    assert report["verdict"] == "doubtful"
+    assert says in report["verdict_reason"]
+    summary = "\n".join(surfel_summary(report))
+    assert ("unusable depth map" in summary) == ("broken" in changed.get("note", ""))
+    assert (CONTRADICTED in summary) == (CONTRADICTED in changed.get("note", ""))
+
+
+@pytest.mark.parametrize(
+    ("refusal", "word"),
+    [
+        ("", "good"),
+        ("a rigid map predicts its tracks as well, or nearly so", "good"),
+        ("too few tracks through several keyframes determine it", "good"),
+        ("only 18% of its landmarks are certain", "doubtful"),
+    ],
+)
+def test_cameras_that_the_whole_clip_does_not_determine_are_doubtful(
+    refusal: str, word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As before a camera that stands still, declared as moving."""
+    record(tmp_path, "sensor")
+    monkeypatch.setattr("pliant.results.surfels._moves_on_own_map", lambda _: True)
+    monkeypatch.setattr("pliant.results.surfels.write_deforming_map", lambda *_: refusal)
+    report = write_results(tmp_path)
+    assert (report["verdict"], report["deforming_map"]) == (word, refusal)
+    assert (word == "good") or refusal in report["verdict_reason"]
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 from breathing_truth import CAMERA, FRAMES, rigid_map, tracks, write_truth
 
 from pliant.algorithms.deformable.held_out import Evidence
-from pliant.algorithms.deformable.judged_map import doubt
+from pliant.algorithms.deformable.judged_map import TOO_FEW, doubt, is_evidence
 from pliant.evaluation.deforming_map_truth import format_deforming_map, judge_deforming_map
 from pliant.evaluation.surface_truth import SurfaceTruth
 from pliant.results.deforming_map import adjust_and_write
@@ -103,3 +103,5 @@ def test_each_doubt_has_its_reason(certain: float, evidence: Evidence, why: str)
     found = doubt(certain, evidence)
     assert why in found
     assert bool(found) == bool(why)
+    assert is_evidence(found) == (found != "" and "rigid" not in found)
+    assert not is_evidence(TOO_FEW)

@@ -9,7 +9,7 @@ from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import transform
 from pliant.algorithms.surfels.camera_alignment import se3_exp
-from pliant.algorithms.surfels.depth_maps import agree
+from pliant.algorithms.surfels.depth_maps import agree, contradiction, measured_otherwise
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 
 CAMERA = PinholeCamera(width=160, height=120, fx=200.0, fy=200.0, cx=79.5, cy=59.5)
@@ -45,6 +45,25 @@ def test_the_map_is_brought_to_the_scale_of_the_surfels() -> None:
     assert found.depth is not None
     assert found.ratio == pytest.approx(2.5)
     np.testing.assert_allclose(found.depth, depth)
+
+
+def test_a_measured_depth_contradicts_surfels_that_have_another() -> None:
+    depth, frame = surface(), surfels(surface())
+    assert not contradiction(depth, frame)
+    assert not contradiction(1.01 * depth, frame)
+    found = contradiction(1.05 * depth, frame)
+    assert found == f"{len(frame.ids)} of the {len(frame.ids)} surfels on it have another depth"
+    half = np.where(np.arange(CAMERA.width) < 70, depth, 1.05 * depth)
+    assert contradiction(half, frame).startswith("99 of the 165")
+    half[:, 70:] = 0.0
+    assert not contradiction(half, frame)
+    half[:, :50] = 0.0  # too few are left
+    assert not contradiction(1.05 * half, frame)
+    points, z = np.array([[50.0, 50.0], [-9.0, 50.0]]), np.repeat(depth[50, 50], 2)
+    off, known = measured_otherwise(1.05 * depth, points, z)
+    assert off.tolist() == known.tolist() == [True, False]
+    off, known = measured_otherwise(1.05 * depth, points, 1.05 * z)
+    assert (off.tolist(), known.tolist()) == ([False, False], [True, False])
 
 
 def test_nothing_is_taken_where_surfels_disagree() -> None:

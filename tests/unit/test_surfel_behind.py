@@ -10,7 +10,7 @@ from surfel_scene import STEP_S, board_renderer, film, motion
 from pliant.algorithms.arrays import I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.surfels.parameters import SurfelParameters
-from pliant.algorithms.surfels.patch_sampling import X
+from pliant.algorithms.surfels.patch_sampling import A, B, X
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
 from pliant.rendering.film import RenderedFrame
@@ -128,3 +128,19 @@ def test_a_camera_that_flies_past_a_surfel() -> None:
         passed |= bool(behind.any())
         assert not (result.state[behind] == SurfelState.TRACKED).any()
     assert passed
+
+
+@pytest.mark.parametrize(("mode", "neighbours"), KINDS)
+def test_surfels_are_not_seen_from_behind(
+    board: tuple[list[RenderedFrame], PinholeCamera], mode: Mode, neighbours: int
+) -> None:
+    """The mirror image is that of the board's back, if it were of glass."""
+    tracker, _ = start(board, mode, neighbours)
+    table = tracker._now.table
+    mirror = np.array([-1.0, 1.0, 1.0])
+    for poses in (table.poses, table.guesses):
+        for part in (X, A, B):
+            poses[:, part : part + 3] *= mirror
+    frame = tracker.track(mirrored(board[0][0].image), STEP_S)
+    assert not (frame.state == SurfelState.TRACKED).any()
+    assert_finite(frame)

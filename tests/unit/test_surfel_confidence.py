@@ -10,6 +10,7 @@ from pliant.algorithms.surfels.patch_sampling import A, X
 from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.algorithms.surfels.surfel_table import SurfelTable, frame_of
 from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
+from pliant.algorithms.surfels.validation import INSIDE
 
 
 def tracked_table(neighbours: int) -> SurfelTable:
@@ -63,6 +64,42 @@ def test_old_positions_of_lost_surfels_do_not_count() -> None:
     assert alone[~lost].mean() > 0.9
     np.testing.assert_allclose(after[alone], before[alone], atol=0.05)
     np.testing.assert_allclose(after[lost], 0.3)
+
+
+def test_a_surfel_that_has_lost_most_of_its_neighbours_is_doubtful() -> None:
+    """What took them may have led it astray, together with the few that are left.  Neighbours that
+    have left the image are no evidence."""
+    table = tracked_table(8)
+    before = confidence(table)
+    row = int(np.argmin(np.linalg.norm(table.poses[:, X : X + 2], axis=1)))
+    ends = table.edges.ends[(table.edges.ends == row).any(axis=1)]
+    neighbours = np.setdiff1d(ends, row)
+    few = max(1, len(neighbours) // 5)
+    table.state[neighbours[few:]] = SurfelState.OCCLUDED
+    left = few / len(neighbours)
+    assert confidence(table)[row] == pytest.approx((0.5 + left) * before[row], abs=0.05)
+    table.state[neighbours] = SurfelState.OCCLUDED
+    assert confidence(table)[row] == pytest.approx(0.5 * table.birth_zncc[row])
+    table.validations[neighbours, INSIDE] = 0.0
+    assert confidence(table)[row] == pytest.approx(table.birth_zncc[row])
+
+
+def test_a_measured_depth_overrules_the_neighbours() -> None:
+    motions = [motion((0.0, 0.0, 0.0), (0.001 * k, 0.0, 0.0)) for k in range(4)]
+    renderer, camera = board_renderer(motions)
+    first, second, third, fourth = film(renderer, 4)
+    tracker = SurfelTracker(SurfelParameters(max_surfels=60, levels=2))
+    tracker.start(first.image, first.depth_m, camera)
+    right = tracker.track(second.image, STEP_S, depth=second.depth_m)
+    assert right.confidence[right.state == SurfelState.TRACKED].min() > 0.5
+    old = right.ids
+    wrong = tracker.track(third.image, STEP_S, depth=1.05 * third.depth_m)
+    tracked = (wrong.state == SurfelState.TRACKED) & np.isin(wrong.ids, old)
+    assert tracked.sum() > 30
+    assert (wrong.confidence[tracked] == 0.0).all()
+    unmeasured = tracker.track(fourth.image, STEP_S)
+    tracked = (unmeasured.state == SurfelState.TRACKED) & np.isin(unmeasured.ids, old)
+    assert np.median(unmeasured.confidence[tracked]) > 0.5
 
 
 def test_on_made_up_depth_a_patch_that_is_distorted_otherwise_is_doubtful() -> None:

@@ -70,6 +70,19 @@ def test_pairs_follow_their_rows() -> None:
     assert len(join_edges(old, new).ends) == len(old.ends) + len(new.ends)
 
 
+def test_a_new_surfel_is_joined_to_those_around_it_alone() -> None:
+    """Not to all others, none of which has another new one that is nearer."""
+    poses = plane(60)
+    new, count = len(poses) - 1, 3
+    edges = find_edges(poses, np.ones(len(poses), np.int64), new, count)
+    distance = np.linalg.norm(poses[:, None, X : X + 3] - poses[None, :, X : X + 3], axis=2)
+    nearest = np.argsort(distance, axis=1)[:, 1 : count + 1]
+    mutual = {i for i in range(new) if i in nearest[new] or new in nearest[i]}
+    assert {(int(i), int(j)) for i, j in edges.ends} == {(i, new) for i in mutual}
+    widely = find_edges(poses, np.ones(len(poses), np.int64), new, count, widely=True)
+    assert {(int(i), int(j)) for i, j in widely.ends} == {(i, new) for i in range(new)}
+
+
 def test_a_stretch_that_surfels_know_of_costs_nothing() -> None:
     poses = plane()
     edges = pairs_of(poses)

@@ -18,7 +18,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.image.masks import glaring
-from pliant.algorithms.surfels.depth_maps import agree
+from pliant.algorithms.surfels.depth_maps import agree, contradiction
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.prediction import predict
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
@@ -34,6 +34,7 @@ from pliant.errors import ConfigError
 from pliant.map_depth import MapDepth, MapView, view_of_window
 from pliant.messages import topics
 from pliant.messages.types import (
+    CONTRADICTED,
     WAITING_FOR_DEPTH,
     WORLD_FRAME_ID,
     CameraStream,
@@ -113,6 +114,8 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
                 interval_s = 1e-9 * (image.stamp_ns - state.stamp_ns)
                 prediction = _prediction(state, heard)
                 frame = state.tracker.track(image.grey, interval_s, prediction, metres)
+                if metres is not None and (problem := contradiction(metres, frame)):
+                    note = f"{CONTRADICTED}: {problem}"
                 frame = _place(state, heard, frame)
             if view is not None:
                 with monitor.stage("births"):

@@ -30,6 +30,8 @@ PASSED_OVER = "passed over to keep up"
 """Why a frame that has pixels has no pose as it comes: it is not mapped, and no tracks place it."""
 WAITING_FOR_DEPTH = "waiting for depth"
 """Why a frame has no surfels yet."""
+CONTRADICTED = "the depth map contradicts the surfels"
+"""Begin of the note of a frame whose measured depth is not that of most surfels."""
 WORLD_FRAME_ID = "world"
 
 _M = TypeVar("_M", bound="Header")

@@ -25,6 +25,7 @@ from pliant.results.surfel_frames import add_final, recorded_surfels, surfels_by
 
 _MOST = 150
 """Keyframes; a longer run has them farther apart."""
+NO_MAP = "the run has no map"
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ def write_deforming_map(path: Path, recording: Path, run: Run) -> str:
     """
     segment = run.history.longest_segment()
     if run.stream is None or segment < 0:
-        return "the run has no map"
+        return NO_MAP
     # A rigid map that deforms estimates a wrong correction: a calibration that is given counts.
     correction = run.correction_of(segment) if run.stream.focal_sigma > 0.0 else ()
     view = corrected_view(run.stream.camera, correction)

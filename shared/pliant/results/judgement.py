@@ -16,10 +16,10 @@ DOUBTS = 0.25
 """Share of doubtful poses above which a run is.  Good sequences have up to a sixth."""
 
 _FOLLOWED = 0.75
-"""Share of the surfels in view that are tracked in a good frame.  In sequences with ground truth
-that are tracked well, nine tenths of the frames have 0.84 and more (cloth, sliding sheets,
-breathing tissue behind an instrument).  With an instrument that pulls tissue, half of them have
-0.67."""
+"""Share of the surfels in view that are tracked in a good frame, and probably right.  In sequences
+with ground truth that are tracked well, nine tenths of the frames have 0.84 and more tracked
+(cloth, sliding sheets, breathing tissue behind an instrument).  With an instrument that pulls
+tissue, half of them have 0.67."""
 
 
 def doubtful_frames(history: MapHistory) -> list[int]:
@@ -83,22 +83,28 @@ def judge(
     return GOOD, text if longest < of_source else "all frames have a pose in one segment"
 
 
-def slipping_frames(tracked: Sequence[int], in_view: Sequence[int]) -> list[int]:
-    """Rows of frames in which few of the surfels in view are tracked."""
+def slipping_frames(tracked: Sequence[float], in_view: Sequence[int]) -> list[int]:
+    """Rows of frames in which few of the surfels in view are tracked.
+
+    tracked: their count, or the sum of their confidences.
+    """
     counts = enumerate(zip(tracked, in_view, strict=True))
     return [row for row, (few, seen) in counts if few < _FOLLOWED * seen]
 
 
 def judge_surfels(
     *, frames: int, in_segments: list[int], slipping: int, depth_from: str, unusable: int,
-    together: int = 0, broken: int = 0, absent: int = 0, behind: int = 0,
-    failed: bool = False,
+    unsure: int = 0, together: int = 0, contradicted: int = 0, map_problem: str = "",
+    broken: int = 0, absent: int = 0, behind: int = 0, failed: bool = False,
 ) -> tuple[str, str]:  # fmt: skip
     """As ``judge``, of a surface that deforms.
 
     in_segments: frames in which the surfels of each start were followed.   slipping: those of them
-    in which few of the surfels in view are.   unusable: depth maps that no surfel could start on.
+    in which few of the surfels in view are.   unsure: those in which few are right, counted by
+    their confidences.   unusable: depth maps that no surfel could start on.
     together: frames of a camera configured as static in which all surfels move together.
+    contradicted: frames whose depth map is not that of most surfels.   map_problem: why the tracks
+    of the whole run do not determine camera and depths; "" without evidence of that.
     """
     word, why = judge(
         frames=frames, in_segments=in_segments, doubtful=0, broken=broken,
@@ -114,6 +120,11 @@ def judge_surfels(
             f"in {slipping / posed:.0%} of the frames less than {_FOLLOWED:.0%} of the surfels in "
             "view are tracked: something covers them, or moves too fast"
         )
+    if unsure > DOUBTS * posed:
+        return DOUBTFUL, (
+            f"in {unsure / posed:.0%} of the frames less than {_FOLLOWED:.0%} of the surfels in "
+            "view are probably right: neighbours disagree about the surface"
+        )
     if word != GOOD:
         return word, why
     if together > DOUBTS * posed:
@@ -121,6 +132,13 @@ def judge_surfels(
             f"in {together / posed:.0%} of the frames all surfels move like one rigid body: if "
             "the camera moves, use --camera moving"
         )
+    if contradicted > (1.0 - _WHOLE) * posed:
+        return DOUBTFUL, (
+            f"in {contradicted / posed:.0%} of the frames the depth map contradicts most surfels: "
+            "the surface stretches, or the image does"
+        )
+    if map_problem:
+        return DOUBTFUL, f"camera and depths are not determined by the whole clip: {map_problem}"
     if unusable > (1.0 - _WHOLE) * frames:
         return DOUBTFUL, f"{unusable / frames:.0%} of the depth maps could not be used"
     if depth_from == "flat":

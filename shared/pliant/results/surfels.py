@@ -9,14 +9,22 @@ from typing import Any
 import numpy as np
 
 from pliant.algorithms.arrays import F64
+from pliant.algorithms.deformable.judged_map import is_evidence
 from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.config import recorded_config
 from pliant.formats.npz import NpzWriter
 from pliant.formats.tum import write_tum
 from pliant.messages import topics
-from pliant.messages.types import DROPPED, MASKED, WAITING_FOR_DEPTH, CameraStream, Surfels
+from pliant.messages.types import (
+    CONTRADICTED,
+    DROPPED,
+    MASKED,
+    WAITING_FOR_DEPTH,
+    CameraStream,
+    Surfels,
+)
 from pliant.recording.reader import Recording
-from pliant.results.deforming_map import write_deforming_map
+from pliant.results.deforming_map import NO_MAP, write_deforming_map
 from pliant.results.folder import (
     DEFORMING_MAP_NAME,
     ONLINE_NAME,
@@ -55,6 +63,7 @@ class _Counts:
     """The counts of the report, by frame."""
 
     alive: list[int] = field(default_factory=list[int])
+    expected: list[float] = field(default_factory=list[float])  # of them, right by confidence
     in_view: list[int] = field(default_factory=list[int])
     listed: list[int] = field(default_factory=list[int])
     lost: list[int] = field(default_factory=list[int])
@@ -94,9 +103,7 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
                 if _followed(surfels):
                     surface.take(surfels)
         write_tum(folder / TRAJECTORY_NAME, _trajectory(followed))
-        report = _report(run, counts, len(followed))
-        if makes_map:
-            report["deforming_map"] = why
+        report = _report(run, counts, len(followed), why if makes_map else None)
         if makes_map and not why:
             write_tum(folder / ONLINE_NAME, _trajectory(online))
         text = json.dumps(report, indent=1) + "\n"
@@ -150,8 +157,11 @@ def surfel_summary(report: dict[str, Any]) -> list[str]:
         f"({', '.join(f'{n} {state}' for state, n in report['last_states'].items()) or 'none'})",
     ]
     notes = list(report["notes"].values())
-    if notes:
-        lines.append(f"{counted(len(notes), 'unusable depth map')}: {notes[0]}")
+    unusable = [note for note in notes if not note.startswith(CONTRADICTED)]
+    if unusable:
+        lines.append(f"{counted(len(unusable), 'unusable depth map')}: {unusable[0]}")
+    if contradicted := [note for note in notes if note.startswith(CONTRADICTED)]:
+        lines.append(f"in {counted(len(contradicted), 'frame')} {contradicted[0]}")
     if not report["segments"]:
         lines.append(f"no surfels could start: {report['last_reason']}")
     elif report["frames_lost"]:
@@ -185,6 +195,9 @@ def _add(npz: NpzWriter, surfels: Surfels) -> None:
 def _count(counts: _Counts, surfels: Surfels, arrival_ns: int, stream: CameraStream | None) -> None:
     states = np.bincount(surfels.state, minlength=len(SurfelState)).tolist()
     counts.alive.append(states[SurfelState.TRACKED])
+    tracked = surfels.state == SurfelState.TRACKED
+    known = len(surfels.confidence) == len(tracked)
+    counts.expected.append(float((surfels.confidence if known else tracked)[tracked].sum()))
     counts.in_view.append(_in_view(surfels, stream))
     counts.listed.append(len(surfels.ids))
     counts.arrivals_ns.append(arrival_ns)
@@ -239,7 +252,8 @@ def _stands_still(metadata: Mapping[str, Mapping[str, str]]) -> bool:
     return recorded_config(metadata, []).surfels.camera == "static"
 
 
-def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
+def _report(run: Run, counts: _Counts, followed: int, refusal: str | None = None) -> dict[str, Any]:
+    """refusal: why there is no map that deforms; None if it is not made."""
     frames = len(counts.alive)
     spent_ns = counts.arrivals_ns[-1] - counts.arrivals_ns[0] if frames else 0
     missing = counts.missing
@@ -248,13 +262,21 @@ def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
         f: why for f, why in sorted(missing.items()) if not why.startswith(WAITING_FOR_DEPTH)
     }
     lost = {*counts.lost, *missing}
-    slipping = [f for f in slipping_frames(counts.alive, counts.in_view) if f not in lost]
+    depth_from = _depth_from(run.recorded.metadata)
+    slipping, unsure = (
+        [frame for frame in slipping_frames(right, counts.in_view) if frame not in lost]
+        for right in (counts.alive, counts.alive if depth_from == "flat" else counts.expected)
+    )
+    contradicted = sum(note.startswith(CONTRADICTED) for note in counts.notes.values())
     word, why = judge_surfels(
         frames=frames - reasons.count(MASKED),
         in_segments=[len(set(members) - lost) for members in counts.segments.values()],
         slipping=len(slipping),
-        depth_from=_depth_from(run.recorded.metadata),
-        unusable=len(counts.notes),
+        unsure=len(unsure),
+        depth_from=depth_from,
+        unusable=len(counts.notes) - contradicted,
+        contradicted=contradicted,
+        map_problem=refusal if refusal and refusal != NO_MAP and is_evidence(refusal) else "",
         together=len(counts.together.frames) if _stands_still(run.recorded.metadata) else 0,
         broken=len(broken_images(without_pixels)),
         absent=absent_frames(run, frames),
@@ -264,7 +286,7 @@ def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
     return {
         "verdict": word,
         "verdict_reason": why,
-        "doubtful_frames": slipping,
+        "doubtful_frames": unsure,
         "source": run.stream.source if run.stream else "",
         "mode": run.stream.mode if run.stream else "",
         "profile": "deformable",
@@ -290,4 +312,5 @@ def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
         "last_states": counts.last_states,
         "scale_is_metric": bool(counts.segments) and is_metric(run.recorded.metadata),
         **process_figures(run, frames),
+        **({} if refusal is None else {"deforming_map": refusal}),
     }

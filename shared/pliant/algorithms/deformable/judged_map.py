@@ -17,6 +17,7 @@ INTERVAL_NS = 190_000_000
 """Least time between two keyframes: 0.2 s, less the jitter of a clock."""
 TOO_FEW = "too few tracks through several keyframes determine it"
 _NO_JUDGES = "too few other tracks judge it"
+_AS_RIGID = "a rigid map predicts its tracks as well, or nearly so"
 _FEWEST = 30
 """Tracks that judge it."""
 _CERTAIN, _PREDICTED, _GAIN, _STIFF = 0.65, 0.95, 0.6, 0.3
@@ -77,10 +78,18 @@ def doubt(certain: float, evidence: Evidence, *, deforms: bool = False) -> str:
     if not evidence.predicted >= _PREDICTED:
         return f"it predicts only {evidence.predicted:.0%} of the tracks that it was not made from"
     if not deforms and not evidence.gain >= _GAIN:
-        return "a rigid map predicts its tracks as well, or nearly so"
+        return _AS_RIGID
     if not evidence.stiff >= _STIFF:
         return (
             f"only {evidence.stiff:.0%} of its landmarks hardly move, "
             "so camera and deformation cannot be told apart"
         )
     return ""
+
+
+def is_evidence(problem: str) -> bool:
+    """Whether a problem speaks against cameras and depths of the whole run.
+
+    Too few tracks are no evidence, and the map of a rigid scene is right.
+    """
+    return problem not in ("", TOO_FEW, _NO_JUDGES, _AS_RIGID)

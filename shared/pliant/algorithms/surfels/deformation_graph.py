@@ -65,12 +65,10 @@ def own_vector(pose: F64, c: F64, out: F64) -> None:
 
 
 @fast_kernel
-def _nearest(
-    points: F64, normals: F64, rows: I64, first_new: int, off_plane: float, out: I64
-) -> None:
+def _nearest(points: F64, normals: F64, rows: I64, first: int, off_plane: float, out: I64) -> None:
     """Fill ``out`` (N, K) with the nearest rows on the same surface, -1 where there are none.
 
-    rows: (N,) 1 where a surfel may be a neighbour.  Of each pair one is at least ``first_new``.
+    rows: (N,) 1 where a surfel may be a neighbour.  Of each pair one is at least ``first``.
     """
     n, wanted = len(points), out.shape[1]
     best = np.empty(wanted)
@@ -78,7 +76,7 @@ def _nearest(
         out[i] = -1
         best[:] = np.inf
         for j in range(n):
-            if j == i or not rows[i] or not rows[j] or (i < first_new and j < first_new):
+            if j == i or not rows[i] or not rows[j] or (i < first and j < first):
                 continue
             squares = off_i = off_j = 0.0
             for k in range(3):
@@ -96,11 +94,15 @@ def _nearest(
             best[at], out[i, at] = squares, j
 
 
-def find_edges(poses: F64, known: I64, first_new: int, count: int) -> Edges:
+def find_edges(
+    poses: F64, known: I64, first_new: int, count: int, *, widely: bool = False
+) -> Edges:
     """Return the ``count`` nearest neighbours of each surfel on the same surface.
 
     poses: (N, POSE_FLOATS).  known: (N,) 1 where the pose is reliable.  first_new: pairs of earlier
-    rows are left out.
+    rows are left out, but they do compete: of few new surfels, the nearest may be far away.
+
+    widely: they do not, so that every earlier surfel is joined to its nearest new ones.
     """
     n = len(poses)
     if n < 2 or count == 0:
@@ -109,9 +111,10 @@ def find_edges(poses: F64, known: I64, first_new: int, count: int) -> Edges:
     normals = np.cross(poses[:, A : A + 3], poses[:, B : B + 3])
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
     nearest = np.empty((n, count), np.int64)
-    _nearest(points, normals, known, first_new, _OFF_PLANE, nearest)
+    _nearest(points, normals, known, first_new if widely else 0, _OFF_PLANE, nearest)
     rows, columns = np.repeat(np.arange(n), count), nearest.ravel()
-    pairs = np.stack([rows, columns], axis=1)[columns >= 0]
+    wanted = (columns >= 0) & (np.maximum(rows, columns) >= first_new)
+    pairs = np.stack([rows, columns], axis=1)[wanted]
     ends = np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64).reshape(-1, 2)
     d = points[ends[:, 1]] - points[ends[:, 0]]
     first, second = np.zeros((len(ends), 3)), np.zeros((len(ends), 3))
@@ -217,6 +220,18 @@ def _between(edges: Edges, known: BoolArray) -> Edges:
     """The pairs of known surfels."""
     rows = known[edges.ends].all(axis=1)
     return Edges(edges.ends[rows], edges.first[rows], edges.second[rows], edges.lengths[rows])
+
+
+def share_of_neighbours(edges: Edges, some: BoolArray, of: BoolArray) -> F64:
+    """(N,) share of each surfel's neighbours among ``of`` that are ``some``, (N,) each; 1 without
+    any.
+    """
+    i, j = edges.ends.T
+    counts = [
+        np.bincount(i, rows[j], len(rows)) + np.bincount(j, rows[i], len(rows))
+        for rows in (some & of, of)
+    ]
+    return np.where(counts[1] > 0, counts[0] / np.maximum(counts[1], 1.0), 1.0)
 
 
 @fast_kernel

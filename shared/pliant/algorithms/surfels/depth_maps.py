@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I64
+from pliant.algorithms.arrays import F64, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
@@ -29,6 +29,8 @@ _MIN_SURFELS = 30
 """Minimum agreeing surfels, besides half of those in the map."""
 _MAX_DISAGREEMENT = 0.02
 """Maximum relative difference between a surfel's depth and the map's, after the median."""
+_AROUND_PX = 2
+"""The measured depth of a surfel is the median over a square that extends this far from it."""
 _REACH = 2.0
 """Surfels within this many patch sides decide whether a depth is right."""
 
@@ -89,6 +91,35 @@ def agree(depth: F64, surfels: SurfelFrame, patch_px: int) -> Agreement:
         return Agreement(ratio, None, f"{count} of the {len(ratios)} surfels on it agree with it")
     reach = _REACH * patch_px
     return Agreement(ratio, np.where(_doubted(depth, pixels, agrees, reach), 0.0, ratio * depth))
+
+
+def measured_otherwise(depth: F64, points_px: F64, z: F64) -> tuple[BoolArray, BoolArray]:
+    """(N,) whether a depth map shows another depth than that of surfels, and whether it shows any.
+
+    depth: (H, W) in units of the surfels, 0 where unknown.  points_px: (N, 2).  z: (N,).
+    """
+    height, width = depth.shape
+    steps = np.arange(-_AROUND_PX, _AROUND_PX + 1)
+    at = np.rint(points_px).astype(np.int64)
+    columns = at[:, 0, None] + np.tile(steps, len(steps))
+    rows = at[:, 1, None] + steps.repeat(len(steps))
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    there = depth[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+    valid = inside & (there > 0.0)
+    known = (valid.sum(axis=1) > 0.5 * valid.shape[1]) & (z > 0.0)
+    middle = np.full(len(z), np.inf)
+    middle[known] = np.nanmedian(np.where(valid, there, np.nan)[known], axis=1)
+    return known & (np.abs(z - middle) > _MAX_DISAGREEMENT * middle), known
+
+
+def contradiction(depth: F64, surfels: SurfelFrame) -> str:
+    """Why a measured depth map shows that most surfels are wrong; "" if it does not."""
+    tracked = surfels.state == SurfelState.TRACKED
+    z = transform(inverse(surfels.T_world_camera), surfels.positions[tracked])[:, 2]
+    off, known = measured_otherwise(depth, surfels.points_px[tracked].astype(np.float64), z)
+    if 2 * off.sum() <= known.sum() or known.sum() < _MIN_SURFELS:
+        return ""
+    return f"{off.sum()} of the {known.sum()} surfels on it have another depth"
 
 
 def _ratios(depth: F64, surfels: SurfelFrame) -> tuple[I64, F64]:

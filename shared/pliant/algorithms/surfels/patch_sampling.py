@@ -182,7 +182,8 @@ def make_grid(side: int) -> Grid:
 def homography(pose: F64, level: Level, out: F64) -> bool:
     """The 9 numbers, row by row, that map the grid (i, j, 1) to homogeneous pixels.
 
-    Returns whether the whole patch of any size up to 64 px lies in front of the camera.
+    Returns whether the whole patch of any size up to 64 px lies in front of the camera, and shows
+    its front: from behind it would be its mirror image.
     """
     for k in range(3):
         a, b = pose[A + k], pose[B + k]
@@ -196,7 +197,12 @@ def homography(pose: F64, level: Level, out: F64) -> bool:
     largest = 0.0
     for k in range(9):
         largest = max(largest, abs(out[k]))
-    return out[8] > 0.0 and largest < _LARGEST
+    front = (
+        out[0] * (out[4] * out[8] - out[5] * out[7])
+        - out[1] * (out[3] * out[8] - out[5] * out[6])
+        + out[2] * (out[3] * out[7] - out[4] * out[6])
+    )
+    return out[8] > 0.0 and front > 0.0 and largest < _LARGEST
 
 
 @fast_kernel(inline=True)

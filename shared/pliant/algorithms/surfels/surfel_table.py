@@ -15,6 +15,7 @@ from pliant.algorithms.surfels.deformation_graph import (
     keep_rows,
     median_strains,
     no_edges,
+    share_of_neighbours,
 )
 from pliant.algorithms.surfels.deformation_models import move_poses
 from pliant.algorithms.surfels.patch_sampling import BIAS, GAIN, POSE_FLOATS, A, B, F, X
@@ -34,6 +35,11 @@ from pliant.algorithms.surfels.validation import (
 _EVEN_STRAIN, _STEEPNESS = 0.15, 1.2
 """Half of the surfels with this median strain are within 1 % of their depth; fitted on the rendered
 scenes of ``scripts/bench surfels``."""
+_ALONE = 0.5
+"""Share of the confidence that stays where a surfel has lost all of its neighbours; with half of
+them it has all."""
+_IN_VIEW = 0.5
+"""Share of a patch inside of the image."""
 _EVEN_DISTORTION, _DISTORTION_STEEPNESS = 0.7, 2.0
 """The same for the distortion, within 3 px in the image; fitted on half of eight videos of tissue,
 tested on the others."""
@@ -53,6 +59,8 @@ class SurfelTable:
     birth: list[Templates] = field(default_factory=_none)  # the same at birth
     renewed: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))  # not that of birth
     birth_zncc: F64 = field(default_factory=lambda: np.zeros(0))  # with the birth template
+    # Whether the depth map of the frame shows another depth.
+    contradicted: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
     # ``patch_distortions`` on made-up depth, else 0.
     distortions: F64 = field(default_factory=lambda: np.zeros(0))
     poses: F64 = field(default_factory=lambda: np.zeros((0, POSE_FLOATS)))  # last good ones
@@ -92,6 +100,7 @@ class SurfelTable:
             setattr(self, name, [join(a, b) for a, b in pairs])
         self.renewed = np.concatenate([self.renewed, np.zeros(n, np.bool_)])
         self.birth_zncc = np.concatenate([self.birth_zncc, np.ones(n)])
+        self.contradicted = np.concatenate([self.contradicted, np.zeros(n, np.bool_)])
         self.distortions = np.concatenate([self.distortions, np.zeros(n)])
         self.poses = np.concatenate([self.poses, poses])
         self.guesses = np.concatenate([self.guesses, poses])
@@ -128,6 +137,7 @@ class SurfelTable:
         for name in (
             "renewed",
             "birth_zncc",
+            "contradicted",
             "distortions",
             "poses",
             "rest",
@@ -143,12 +153,17 @@ class SurfelTable:
         ):
             setattr(self, name, np.ascontiguousarray(getattr(self, name)[rows]))
 
-    def connect(self, first_new: int, count: int, *, with_earlier: bool) -> None:
-        """Connect the rows from ``first_new`` on with their neighbours, earlier ones or not."""
+    def connect(
+        self, first_new: int, count: int, *, with_earlier: bool, widely: bool = False
+    ) -> None:
+        """Connect the rows from ``first_new`` on with their neighbours, earlier ones or not.
+
+        widely: as in ``find_edges``.
+        """
         known = self.tracked.astype(np.int64)
         if not with_earlier:
             known[:first_new] = 0
-        new = find_edges(self.guesses, known, first_new, count)
+        new = find_edges(self.guesses, known, first_new, count, widely=widely)
         self.edges = join_edges(self.edges, new)
 
     @property
@@ -210,16 +225,21 @@ def _confidence(table: SurfelTable, *, depth_is_known: bool) -> F64:
     made-up depth a surfel that slides in the image is distorted otherwise than they are.  An error
     that all of them share shows in neither.  Only surfels that are both tracked are compared: the
     others have old positions.  Without such edges the ZNCC with the birth template remains, and
-    half of it where a surfel is not tracked.
+    half of it where a surfel is not tracked.  Few that are left of many neighbours may have been
+    led astray by what took the others.  A measured depth overrules all of them.
     """
     if depth_is_known:
         off = median_strains(table.poses, table.edges, table.tracked) / _EVEN_STRAIN
         agreement = 1.0 / (1.0 + off**_STEEPNESS)
+        in_view = table.tracked | (table.validations[:, INSIDE] >= _IN_VIEW)
+        left = share_of_neighbours(table.edges, table.tracked, in_view)
+        trust = np.where(table.tracked, np.minimum(1.0, _ALONE + left), 1.0)
     else:
         off = np.where(table.tracked, table.distortions, np.nan) / _EVEN_DISTORTION
-        agreement = 1.0 / (1.0 + off**_DISTORTION_STEEPNESS)
+        agreement, trust = 1.0 / (1.0 + off**_DISTORTION_STEEPNESS), 1.0
     likeness = np.clip(table.birth_zncc, 0.0, 1.0) * np.where(table.tracked, 1.0, 0.5)
-    return np.where(np.isnan(agreement), likeness, agreement)
+    found = trust * np.where(np.isnan(agreement), likeness, agreement)
+    return np.where(table.contradicted, 0.0, found)
 
 
 def _f32(values: F64) -> F32:

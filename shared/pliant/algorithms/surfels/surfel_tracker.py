@@ -14,7 +14,7 @@ from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.surfels import validation
 from pliant.algorithms.surfels.births import find_births
 from pliant.algorithms.surfels.brightness import exposure
-from pliant.algorithms.surfels.depth_maps import depth_between
+from pliant.algorithms.surfels.depth_maps import depth_between, measured_otherwise
 from pliant.algorithms.surfels.frame_tracker import FrameTracker, Segment
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.patch_sampling import Level, X
@@ -96,6 +96,7 @@ class SurfelTracker:
                 self._frames.update_templates(self._now, pyramid, self._frame)
         self._since_birth_s += interval_s
         self._count_lost_seconds(interval_s)
+        self._compare(depth)
         if self._parameters.depth_from == "flat":
             depth = self._made_up_depth()
         if depth is not None:
@@ -196,6 +197,15 @@ class SurfelTracker:
                 self._parameters.patch_px,
             )  # fmt: skip
 
+    def _compare(self, depth: F64 | None) -> None:
+        """Mark the tracked surfels that a measured depth contradicts."""
+        table = self._now.table
+        table.contradicted = np.zeros(len(table), np.bool_)
+        if depth is not None and self._parameters.depth_from == "sensor":
+            points = table.validations[:, validation.U : validation.V + 1]
+            off, _ = measured_otherwise(depth, points, self._now.in_camera()[:, X + 2])
+            table.contradicted = off & table.tracked
+
     def _count_lost_seconds(self, interval_s: float) -> None:
         followed = int(self._now.table.tracked.sum())
         by_chance = self._lost_for_s > 0.0 and followed < _BY_CHANCE * self._followed
@@ -254,7 +264,9 @@ class SurfelTracker:
         # The heuristic covariance of section V: a share of the surfel's depth, all directions.
         sigmas = np.maximum(p.expected_motion * births.poses[:, X + 2], 1e-9)
         table.add(births, now.T_world_camera, self._next_id, self._frame, sigmas, self._exposure())
-        table.connect(len(table) - n, p.neighbours, with_earlier=not flat)
+        # A map errs in the depth of all new surfels, which the whole surface averages.
+        widely = p.depth_from == "map"
+        table.connect(len(table) - n, p.neighbours, with_earlier=not flat, widely=widely)
         self._next_id += n
         self._followed = int(table.tracked.sum())
         now.lost = self._followed < p.min_alive
