@@ -17,6 +17,7 @@ from pliant.algorithms.slam.calibration.corrected_view import corrected_view
 from pliant.config import load_config
 from pliant.datasets import open_source
 from pliant.datasets.builtin import builtin_folder
+from pliant.datasets.builtin_deforming import SURFACES_NAME
 from pliant.datasets.rectifier import Rectifier
 from pliant.evaluation.deforming_map_truth import DeformingMapErrors, judge_deforming_map
 from pliant.evaluation.surface_truth import SurfaceTruth
@@ -56,7 +57,7 @@ def measure_maps(sources: Sequence[str]) -> Iterator[str]:
     windows: list[list[str]] = []
     for source in sources or _SOURCES:
         found, row = _judged(source)
-        cells = ["none", found] if isinstance(found, str) else _cells(found)
+        cells = [found] if isinstance(found, str) else _cells(found)
         windows.append([_short(source), *row])
         yield "| " + " | ".join([_short(source), *cells]) + " |"
     yield "\nwhile it runs: the map of the last 3 s, once a second"
@@ -64,7 +65,7 @@ def measure_maps(sources: Sequence[str]) -> Iterator[str]:
 
 
 def _judged(source: str) -> tuple[DeformingMapErrors | str, list[str]]:
-    """Errors, or why there is no map; and a row of the windows."""
+    """Errors, or why there are none; and a row of the windows."""
     dataset, history = open_source(source), MapHistory()
     pipeline = Pipeline(dataset.calibration, load_config(), history)
     camera = Rectifier(dataset.calibration).camera
@@ -93,10 +94,11 @@ def _judged(source: str) -> tuple[DeformingMapErrors | str, list[str]]:
         problem = adjust_and_write(file, history, camera, tracks)
         trusted = [each for each in windows if len(each.frames)]
         row = [str(len(windows)), str(len(trusted))]
-        if not trusted:
-            return problem, [*row, "", "", "", ""]
+        time = f"{1e3 * spent_s / max(len(windows), 1):.0f}"
+        if not (builtin_folder(source) / SURFACES_NAME).is_file():
+            return problem or "made; its scene has no exact surfaces", [*row, "", "", "", time]
         truth = SurfaceTruth(builtin_folder(source), camera)
-        row += [*_window_cells(trusted, truth), f"{1e3 * spent_s / len(windows):.0f}"]
+        row += [*(_window_cells(trusted, truth) if trusted else ["", "", ""]), time]
         return problem or judge_deforming_map(file, truth), row
 
 

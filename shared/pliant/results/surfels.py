@@ -1,6 +1,7 @@
 """Turns a recording of surfels into the files that a user opens: see docs/surfels.md."""
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -51,6 +52,7 @@ from pliant.results.surfel_frames import corrector, final_surfels
 from pliant.trajectory import Trajectory
 from pliant.wording import counted
 
+_Followed = tuple[int, int, F64]
 _PER_SURFEL = (
     *("ids", "positions", "tangents", "deformations", "points_px", "zncc", "visible", "sigma"),
     *("gains", "biases", "state", "age", "born", "tried", "birth_zncc"),
@@ -83,9 +85,9 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
     """
     recording = output / RECORDING_NAME
     run, counts = read_run(recording), _Counts()
-    followed: list[tuple[int, F64]] = []
+    followed: list[_Followed] = []
     surface = Surface()
-    online: list[tuple[int, F64]] = []
+    online: list[_Followed] = []
     with all_or_none(output) as folder:
         makes_map, why = _moves_on_own_map(run.recorded.metadata), ""
         if makes_map:
@@ -126,20 +128,24 @@ def surfel_report(recording: Path) -> dict[str, Any]:
 
 
 def surfel_trajectory(recording: Path) -> Trajectory:
-    """The camera's final pose of every frame whose surfels were followed."""
+    """The camera's final poses in the longest segment."""
     return _trajectory([f for surfels in final_surfels(recording) for f in _followed(surfels)])
 
 
-def _followed(surfels: Surfels) -> list[tuple[int, F64]]:
-    """Time and pose of a frame, none where it has no pixels or all surfels were lost."""
+def _followed(surfels: Surfels) -> list[_Followed]:
+    """Segment, time and pose of a frame, none where it has no pixels or all surfels were lost."""
     lost = surfels.missing or surfels.lost
-    return [] if lost else [(surfels.stamp_ns, surfels.T_world_camera)]
+    return [] if lost else [(surfels.segment, surfels.stamp_ns, surfels.T_world_camera)]
 
 
-def _trajectory(followed: list[tuple[int, F64]]) -> Trajectory:
+def _trajectory(followed: list[_Followed]) -> Trajectory:
+    """Of the longest segment, the first of such: each has a world of its own."""
+    lengths = Counter(segment for segment, _, _ in followed)
+    longest = max(sorted(lengths), key=lengths.__getitem__, default=-1)
+    poses = [(stamp_ns, pose) for segment, stamp_ns, pose in followed if segment == longest]
     return Trajectory(
-        stamps_ns=np.array([stamp_ns for stamp_ns, _ in followed], np.int64),
-        T_world_camera=np.array([pose for _, pose in followed]).reshape(-1, 4, 4),
+        stamps_ns=np.array([stamp_ns for stamp_ns, _ in poses], np.int64),
+        T_world_camera=np.array([pose for _, pose in poses]).reshape(-1, 4, 4),
     )
 
 
@@ -298,7 +304,7 @@ def _report(run: Run, counts: _Counts, followed: int, refusal: str | None = None
         "frames_per_second": round((frames - 1) * 1e9 / spent_ns, 2) if spent_ns > 0 else 0.0,
         "success_rate": followed / frames if frames else 0.0,
         "segments": [
-            {"id": segment, "first_frame": members[0], "frames": len(members)}
+            {"id": segment, "first_frame": members[0], "frames": len(set(members) - lost)}
             for segment, members in sorted(counts.segments.items())
         ],
         "last_reason": reasons[-1] if reasons else "no frames",

@@ -113,7 +113,7 @@ class DeformingWindow:
             [view.pixels(k.points_px).astype(np.float64) for k in keyframes],
             _start(keyframes, rigid),
             view.camera,
-            deforms=continues,
+            must_deform=not continues,
         )
         if isinstance(judged, str) or judged.problem:
             if keyframes[-1].T_world_camera is None:

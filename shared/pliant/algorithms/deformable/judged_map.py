@@ -45,12 +45,12 @@ def judged_map(
     T_world_camera: F64,
     camera: PinholeCamera,
     *,
-    deforms: bool = False,
+    must_deform: bool = False,
 ) -> JudgedMap | str:
     """Adjust K keyframes; where their tracks determine nothing, the reason.
 
     ids, points_px: (N,) and (N, 2) tracks of each.    T_world_camera: (K, 4, 4) start.
-    deforms: whether it is known that the scene deforms: then it may rest for a while.
+    must_deform: refuse it where a rigid map does as well.
     """
     size = camera.width, camera.height
     chosen, landmarks = choose_tracks(list(ids), list(points_px), *size)
@@ -67,17 +67,17 @@ def judged_map(
         evidence = weigh(found, held_out, camera)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return TOO_FEW
-    problem = doubt(float(found.reliable.mean()), evidence, deforms=deforms)
+    problem = doubt(float(found.reliable.mean()), evidence, must_deform=must_deform)
     return JudgedMap(found=found, tracks=chosen, ids=landmarks, problem=problem)
 
 
-def doubt(certain: float, evidence: Evidence, *, deforms: bool = False) -> str:
+def doubt(certain: float, evidence: Evidence, *, must_deform: bool = False) -> str:
     """Why a map is not to be trusted, "" where it is."""
     if not certain >= _CERTAIN:
         return f"only {certain:.0%} of its landmarks are certain"
     if not evidence.predicted >= _PREDICTED:
         return f"it predicts only {evidence.predicted:.0%} of the tracks that it was not made from"
-    if not deforms and not evidence.gain >= _GAIN:
+    if must_deform and not evidence.gain >= _GAIN:
         return _AS_RIGID
     if not evidence.stiff >= _STIFF:
         return (
@@ -88,8 +88,6 @@ def doubt(certain: float, evidence: Evidence, *, deforms: bool = False) -> str:
 
 
 def is_evidence(problem: str) -> bool:
-    """Whether a problem speaks against cameras and depths of the whole run.
-
-    Too few tracks are no evidence, and the map of a rigid scene is right.
-    """
-    return problem not in ("", TOO_FEW, _NO_JUDGES, _AS_RIGID)
+    """Whether a problem speaks against cameras and depths of the whole run: too few tracks do
+    not."""
+    return problem not in ("", TOO_FEW, _NO_JUDGES)
