@@ -94,11 +94,11 @@ def _judged(source: str) -> tuple[DeformingMapErrors | str, list[str]]:
         problem = adjust_and_write(file, history, camera, tracks)
         trusted = [each for each in windows if len(each.frames)]
         row = [str(len(windows)), str(len(trusted))]
-        time = f"{1e3 * spent_s / max(len(windows), 1):.0f}"
+        cost = f"{1e3 * spent_s / max(len(windows), 1):.0f}"
         if not (builtin_folder(source) / SURFACES_NAME).is_file():
-            return problem or "made; its scene has no exact surfaces", [*row, "", "", "", time]
+            return problem or "has one; its exact surface is unknown", [*row, "", "", "", cost]
         truth = SurfaceTruth(builtin_folder(source), camera)
-        row += [*(_window_cells(trusted, truth) if trusted else ["", "", ""]), time]
+        row += [*(_window_cells(trusted, truth) if trusted else ["", "", ""]), cost]
         return problem or judge_deforming_map(file, truth), row
 
 
