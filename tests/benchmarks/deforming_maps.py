@@ -92,6 +92,7 @@ def _judged(source: str) -> tuple[DeformingMapErrors | str, list[str]]:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "deforming_map.npz"
         problem = adjust_and_write(file, history, camera, tracks)
+        problem = problem and f"none: {problem}"
         trusted = [each for each in windows if len(each.frames)]
         row = [str(len(windows)), str(len(trusted))]
         cost = f"{1e3 * spent_s / max(len(windows), 1):.0f}"

@@ -146,9 +146,10 @@ def test_files_that_are_no_trajectories(tmp_path: Path) -> None:
     with pytest.raises(ResultError, match="folder"):
         read_tum(tmp_path)
     binary = tmp_path / "binary"
-    binary.write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(ResultError, match="not a text file"):
-        read_tum(binary)
+    for data in (b"\x80\x81\x00\x01", b"\xff\xfe\x00"):  # the second begins like UTF-16
+        binary.write_bytes(data)
+        with pytest.raises(ResultError, match="not a text file"):
+            read_tum(binary)
     empty = tmp_path / "empty"
     empty.write_text("# nothing\n")
     with pytest.raises(ResultError, match="holds no poses"):
