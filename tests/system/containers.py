@@ -9,7 +9,7 @@ import signal
 import subprocess
 import tarfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -162,9 +162,14 @@ class Session:
         return json.loads(docker("inspect", "--format", "{{json .State}}", self.container(service)))
 
     def kill(self, *services: str) -> None:
-        """kill -9 as the kernel does it: ``docker kill`` would keep the engine from restarting."""
+        """kill -9 as the kernel does it: ``docker kill`` would keep the engine from restarting.
+
+        A service that has ended while the engine was asked stays so.
+        """
         for pid in [int(str(self.state(service)["Pid"])) for service in services]:
-            os.kill(pid, signal.SIGKILL)
+            if pid:  # 0: it has ended
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
 
     def wait(self, service: str) -> None:
         """Return when a service's container has ended well, after restarts perhaps."""
