@@ -9,7 +9,7 @@ from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import transform
 from pliant.algorithms.surfels.camera_alignment import se3_exp
-from pliant.algorithms.surfels.depth_maps import agree, contradiction, measured_otherwise
+from pliant.algorithms.surfels.depth_maps import agree, contradicted_by_depth, contradiction
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 
 CAMERA = PinholeCamera(width=160, height=120, fx=200.0, fy=200.0, cx=79.5, cy=59.5)
@@ -60,9 +60,9 @@ def test_a_measured_depth_contradicts_surfels_that_have_another() -> None:
     half[:, :50] = 0.0  # too few are left
     assert not contradiction(1.05 * half, frame)
     points, z = np.array([[50.0, 50.0], [-9.0, 50.0]]), np.repeat(depth[50, 50], 2)
-    off, known = measured_otherwise(1.05 * depth, points, z)
+    off, known = contradicted_by_depth(1.05 * depth, points, z)
     assert off.tolist() == known.tolist() == [True, False]
-    off, known = measured_otherwise(1.05 * depth, points, 1.05 * z)
+    off, known = contradicted_by_depth(1.05 * depth, points, 1.05 * z)
     assert (off.tolist(), known.tolist()) == ([False, False], [True, False])
 
 

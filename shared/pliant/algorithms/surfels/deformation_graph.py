@@ -97,12 +97,13 @@ def _nearest(points: F64, normals: F64, rows: I64, first: int, off_plane: float,
 def find_edges(
     poses: F64, known: I64, first_new: int, count: int, *, widely: bool = False
 ) -> Edges:
-    """Return the ``count`` nearest neighbours of each surfel on the same surface.
+    """Connect each surfel with its ``count`` nearest neighbours on the same surface.
 
-    poses: (N, POSE_FLOATS).  known: (N,) 1 where the pose is reliable.  first_new: pairs of earlier
-    rows are left out, but they do compete: of few new surfels, the nearest may be far away.
+    Only edges to new surfels are returned.  An earlier surfel gets one if a new surfel is among its
+    nearest neighbours of all, old and new.
 
-    widely: they do not, so that every earlier surfel is joined to its nearest new ones.
+    poses: (N, POSE_FLOATS).  known: (N,) 1 where the pose is reliable.  first_new: row of the first
+    new surfel.  widely: each earlier surfel is connected with its nearest new ones, however far.
     """
     n = len(poses)
     if n < 2 or count == 0:

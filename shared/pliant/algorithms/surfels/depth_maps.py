@@ -93,8 +93,8 @@ def agree(depth: F64, surfels: SurfelFrame, patch_px: int) -> Agreement:
     return Agreement(ratio, np.where(_doubted(depth, pixels, agrees, reach), 0.0, ratio * depth))
 
 
-def measured_otherwise(depth: F64, points_px: F64, z: F64) -> tuple[BoolArray, BoolArray]:
-    """(N,) whether a depth map shows another depth than that of surfels, and whether it shows any.
+def contradicted_by_depth(depth: F64, points_px: F64, z: F64) -> tuple[BoolArray, BoolArray]:
+    """(N,) whether a depth map contradicts the depths of surfels, and whether it has one there.
 
     depth: (H, W) in units of the surfels, 0 where unknown.  points_px: (N, 2).  z: (N,).
     """
@@ -116,7 +116,7 @@ def contradiction(depth: F64, surfels: SurfelFrame) -> str:
     """Why a measured depth map shows that most surfels are wrong; "" if it does not."""
     tracked = surfels.state == SurfelState.TRACKED
     z = transform(inverse(surfels.T_world_camera), surfels.positions[tracked])[:, 2]
-    off, known = measured_otherwise(depth, surfels.points_px[tracked].astype(np.float64), z)
+    off, known = contradicted_by_depth(depth, surfels.points_px[tracked].astype(np.float64), z)
     if 2 * off.sum() <= known.sum() or known.sum() < _MIN_SURFELS:
         return ""
     return f"{off.sum()} of the {known.sum()} surfels on it have another depth"

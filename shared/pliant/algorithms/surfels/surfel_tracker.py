@@ -14,7 +14,7 @@ from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.surfels import validation
 from pliant.algorithms.surfels.births import find_births
 from pliant.algorithms.surfels.brightness import exposure
-from pliant.algorithms.surfels.depth_maps import depth_between, measured_otherwise
+from pliant.algorithms.surfels.depth_maps import contradicted_by_depth, depth_between
 from pliant.algorithms.surfels.frame_tracker import FrameTracker, Segment
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.patch_sampling import Level, X
@@ -203,7 +203,7 @@ class SurfelTracker:
         table.contradicted = np.zeros(len(table), np.bool_)
         if depth is not None and self._parameters.depth_from == "sensor":
             points = table.validations[:, validation.U : validation.V + 1]
-            off, _ = measured_otherwise(depth, points, self._now.in_camera()[:, X + 2])
+            off, _ = contradicted_by_depth(depth, points, self._now.in_camera()[:, X + 2])
             table.contradicted = off & table.tracked
 
     def _count_lost_seconds(self, interval_s: float) -> None:
